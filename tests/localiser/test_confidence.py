@@ -166,3 +166,20 @@ def test_a_trial_ends_where_nothing_comes() -> None:
     assert chain.position.node_from_live.distance_m == pytest.approx(5.0)
     drive(chain, 26.0)
     assert not chain.on_trial
+
+
+@given(st.floats(-30, 30), st.floats(0, 10))
+def test_a_calibration_leaves_order_and_what_is_not_believed_as_they_are(
+    total: float, more: float
+) -> None:
+    calibration = confidence_of(BRIEF).calibration
+    assert calibration.log_odds(total) <= calibration.log_odds(total + more)
+    assert calibration.log_odds(min(total, calibration.knee)) == min(total, calibration.knee)
+    assert calibration.log_odds(-math.inf) == -math.inf
+
+
+def test_beyond_the_limit_of_acceptance_claims_grow_more_slowly() -> None:
+    claimed = confidence_of(BRIEF).calibration.log_odds
+    assert claimed(5.0) == pytest.approx(4.74, abs=0.005)
+    assert claimed(6.0) == pytest.approx(5.39, abs=0.005)
+    assert claimed(8.5) == pytest.approx(7.01, abs=0.005)

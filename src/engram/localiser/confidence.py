@@ -221,9 +221,6 @@ class Calibration:
         return total - (1.0 - self.slope) * max(total - self.knee, 0.0)
 
 
-AS_SUMMED = Calibration(knee=0.0, slope=1.0)
-
-
 @dataclass(frozen=True, slots=True)
 class ConfidenceModel:
     """Weights of the terms, one kind of features and one matcher.

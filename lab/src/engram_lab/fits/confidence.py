@@ -30,7 +30,6 @@ from engram.frontend import BRIEF, DescriptorKind
 from engram.localiser import METHOD_VERSION, AcceptanceConfig, Spread
 from engram.localiser.confidence import (
     ANYWHERE_TERMS,
-    AS_SUMMED,
     DOUBTED_TERMS,
     PREDICTED_TERMS,
     TOLD_TERMS,
@@ -60,6 +59,8 @@ Array = NDArray[np.float64]
 # Tries of each kind on each street.
 TRIES = {Kind.UNDISTURBED: 1, Kind.TOLD: 24, Kind.CARRIED: 24, Kind.GAP: 6, Kind.LOST: 6}
 _LOST_ROUNDS = 8
+# Before there is a calibration.
+AS_SUMMED = Calibration(knee=0.0, slope=1.0)
 # What a second match adds that agrees: two look-alikes agree more often than chance has it.
 WITNESS = 1.4
 # A robot that is told a wrong place is not looked for elsewhere: what it believes there counts.
