@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -20,7 +21,15 @@ from engram.frontend import StereoPair
 from engram.geometry import SE3, StereoCamera
 from engram.graph.model import NodeId
 from engram.maps import Map
-from engram_lab.studies.faults.clips import JUDGING, MAPPED, REVERSED, SETTING, Clip, ClipDrive
+from engram_lab.studies.faults.clips import (
+    DOCTORED,
+    JUDGING,
+    MAPPED,
+    REVERSED,
+    SETTING,
+    Clip,
+    ClipDrive,
+)
 from engram_lab.studies.faults.injected import (
     FAULTS,
     Blackout,
@@ -102,6 +111,16 @@ def test_trials_are_drawn_from_their_number_and_no_clip_of_the_limits_is_judged(
 def test_each_judged_town_is_driven_once_against_its_map() -> None:
     assert [plan.town for plan in REVERSED] == list(dict.fromkeys(plan.town for plan in JUDGING))
     assert {plan.session for plan in REVERSED}.isdisjoint({MAPPED})
+
+
+def test_the_doctor_is_judged_on_twenty_drives_of_each_rig_in_other_towns() -> None:
+    drives = Counter(plan.rig for plan in DOCTORED)
+    assert set(drives.values()) == {20}
+    assert set(drives) == {plan.rig for plan in JUDGING}
+    for rig in drives:
+        assert len({plan.session for plan in DOCTORED if plan.rig == rig}) == 20
+    others = {plan.town for plan in [*SETTING, *JUDGING, *REVERSED]}
+    assert others.isdisjoint(plan.town for plan in DOCTORED)
 
 
 def test_results_are_read_as_far_as_they_are_whole_and_counted(tmp_path: Path) -> None:

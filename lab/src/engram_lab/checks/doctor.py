@@ -3,9 +3,10 @@
 python -m engram_lab.checks.doctor                    # rendered clips, and real ones of ENGRAM_DATA
 python -m engram_lab.checks.doctor --report           # only the table of what was run
 
-Limits were set on the clips of `clips.SETTING`; these are others, of five rigs. Each window of a
-clip is shown as it is, at rest, and with each fault at a strength drawn log-uniformly from its
-stated least one on. Results go to a file as they come; the same command goes on where it stopped.
+Limits were set on the clips of `clips.SETTING`; these are others, twenty drives of each of five
+rigs. Each drive is shown as it is, at rest, and with each fault at a strength drawn log-uniformly
+from its stated least one on. Results go to a file as they come; the same command goes on where it
+stopped.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from engram.geometry import SE3
 from engram.graph.model import Clock
 from engram.robot import Front, Settings
 from engram_lab.programs import Figure, command_line, report
-from engram_lab.studies.faults.clips import JUDGING
+from engram_lab.studies.faults.clips import DOCTORED
 from engram_lab.studies.faults.injected import (
     Frozen,
     LateSide,
@@ -223,16 +224,10 @@ KINDS: dict[str, Kind] = {
 
 
 def windows() -> Iterator[Window]:
-    """Windows of the rendered clips that are in the cache, and of the real ones."""
-    for plan in JUDGING:
-        if not plan.path().exists():
-            continue
+    """The rendered clips, made first where the cache lacks them, and windows of the real ones."""
+    for plan in DOCTORED:
         clip = plan.read()
-        for first in range(0, len(clip) - _WINDOW + 1, _WINDOW + 4):
-            part = slice(first, first + _WINDOW)
-            yield Window(
-                f"{plan.name}@{first}", plan.rig, clip.pairs[part], clip.world_from_cam[part]
-            )
+        yield Window(plan.name, plan.rig, clip.pairs, clip.world_from_cam)
     data = os.environ.get("ENGRAM_DATA")
     for name, rig in _REAL if data else ():
         drive = engram.open_drive(Path(data or "") / name, rig=rig)
@@ -294,15 +289,11 @@ def _alarms(found: Diagnosis) -> list[str]:
     return [one.code for one in found.findings if one.severity is not Severity.NOTE]
 
 
-def run(file: Path, most_windows: int) -> None:
+def run(file: Path) -> None:
     """Makes the trials that the file lacks, window by window."""
     done = {(one["window"], one["kind"]) for one in _kept(file)}
     file.parent.mkdir(parents=True, exist_ok=True)
-    rigs: dict[str, int] = defaultdict(int)
     for window in windows():
-        rigs[window.rig] += 1
-        if rigs[window.rig] > most_windows:
-            continue
         with file.open("a", encoding="utf-8") as out:
             for kind in (*_HEALTHY, *KINDS):
                 if (window.name, kind) in done or (
@@ -338,11 +329,10 @@ def main() -> None:
     parser = command_line(__doc__)
     default = user_cache_path("engram") / "faults" / "doctor.jsonl"
     parser.add_argument("--work", type=Path, default=default, help="where trials are kept")
-    parser.add_argument("--windows", type=int, default=20, help="most windows of a rig")
     parser.add_argument("--report", action="store_true", help="run nothing")
     asked = parser.parse_args()
     if not asked.report:
-        run(asked.work, asked.windows)
+        run(asked.work)
     report(figures(asked.work), asked.json, "the doctor, on drives that its limits never saw")
 
 

@@ -1,7 +1,8 @@
 """Short rendered drives with images and truth, kept in the user's cache: rendered once, read often.
 
 A clip is a stretch of a small town, seen by one rig on one day. Limits are set on the clips of
-`SETTING`, and judged on those of `JUDGING`: other towns, and rigs that the limits never saw.
+`SETTING`, and judged on those of `JUDGING`: other towns, and rigs that the limits never saw. The
+doctor is judged on the shorter ones of `DOCTORED`, twenty drives of each rig.
 
 python -m engram_lab.studies.faults.clips             # renders what is missing
 """
@@ -197,6 +198,16 @@ REVERSED = [
     for town, first in enumerate(range(0, len(JUDGING), 1 + _LIVE))
 ]
 
+# Twenty drives of each rig, other days of the village, in two towns that nothing else shows.
+DOCTORED = [
+    ClipPlan(rig, town, session, count=24)
+    for rig, first in (
+        ("bicycle", 51), ("kitti", 53), ("shuttle", 55), ("wildcat", 57), ("courier", 59)
+    )
+    for town, sessions in ((first, _OTHERS[:10]), (first + 1, _OTHERS[10:]))
+    for session in sessions
+]  # fmt: skip
+
 
 def _render(plan: ClipPlan, path: Path) -> None:
     drive = drive_of(plan)
@@ -243,7 +254,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.parse_args()
-    for plan in missing([*SETTING, *JUDGING, *REVERSED]):
+    for plan in missing([*SETTING, *JUDGING, *REVERSED, *DOCTORED]):
         _render(plan, plan.path())
         print(plan.path(), flush=True)
 
