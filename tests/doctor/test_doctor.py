@@ -259,6 +259,19 @@ def test_odometry_that_is_unsure_of_its_steps_tells_no_scale(sigma_m: float, off
     assert scale_off(seen) == (off and pytest.approx(off))
 
 
+def test_a_scale_is_told_by_the_median_of_ways_unless_they_spread_too_far() -> None:
+    def off(ratios: list[float]) -> float | None:
+        told = [SE3(np.eye(3), np.array([0, 0, 2.0]))] * len(ratios)
+        moved = [SE3(np.eye(3), np.array([0, 0, 2.0 * one])) for one in ratios]
+        seen = Evidence(DoctorConfig(), moved=list(moved), outside=list(told))
+        seen.sigma_m = [0.1] * len(ratios)
+        return scale_off(seen)
+
+    assert off([1.1, 1.15, 1.2, 1.16, 1.14] * 2) == pytest.approx(0.15)
+    assert off([0.8, 1.15, 1.5, 1.16, 0.9] * 2) is None
+    assert off([1.15] * 2) is None
+
+
 def test_a_picture_shows_in_red_what_is_wrong_and_no_chance_matches(pairs) -> None:
     left, right = pairs[0].left.copy(), pairs[0].right.copy()
     left[40:120, 300:460] = right[70:150, 700:860] = RNG.integers(0, 255, (80, 160))

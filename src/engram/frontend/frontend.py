@@ -22,7 +22,7 @@ from engram.geometry import StereoCamera
 FRONTEND_VERSION = 1
 
 _THUMBNAIL_WIDTH_PX = 160
-_SMALLEST_SIDE_PX = 64
+SMALLEST_SIDE_PX = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,8 +190,8 @@ def check_pair(pair: StereoPair) -> None:
                 f"{name} image at {stamp_ns} ns is {image.dtype} {image.shape}, must be grey: "
                 f"uint8 {expected}, the camera's (height, width)"
             )
-        if min(expected) < _SMALLEST_SIDE_PX:
+        if min(expected) < SMALLEST_SIDE_PX:
             raise SequenceError(
                 f"{name} image is {expected[1]}×{expected[0]} px, the front-end needs at least "
-                f"{_SMALLEST_SIDE_PX} px in both directions"
+                f"{SMALLEST_SIDE_PX} px in both directions"
             )

@@ -27,6 +27,7 @@ from platformdirs import user_cache_path
 import engram
 from engram.doctor import Diagnosis, Facts, Severity
 from engram.frontend import StereoPair
+from engram.frontend.frontend import SMALLEST_SIDE_PX
 from engram.geometry import SE3
 from engram.graph.model import Clock
 from engram.robot import Front, Settings
@@ -151,14 +152,16 @@ def _step(window: Window, factor: float, _: np.random.Generator) -> list[StereoP
     ]
 
 
-def _other_focal_length(window: Window, by: float, _: np.random.Generator) -> list[StereoPair]:
-    camera = window.pairs[0].camera
-    wrong = replace(camera, fx=camera.fx * (1 + by), fy=camera.fy * (1 + by))
+def _other_focal_length(window: Window, by: float, rng: np.random.Generator) -> list[StereoPair]:
+    camera, factor = window.pairs[0].camera, (1 + by) ** rng.choice([-1, 1])
+    wrong = replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
     return [replace(one, camera=wrong) for one in window.pairs]
 
 
 def _fewer(pair: StereoPair, px_per_deg: float) -> StereoPair:
-    return halved(pair, float(np.radians(pair.camera.fx)) / px_per_deg)
+    # Images that the front-end refuses as too small never come to the doctor.
+    largest = min(pair.left.shape) / SMALLEST_SIDE_PX
+    return halved(pair, min(float(np.radians(pair.camera.fx)) / px_per_deg, largest))
 
 
 KINDS: dict[str, Kind] = {
@@ -192,7 +195,7 @@ KINDS: dict[str, Kind] = {
     "upside down": Kind(
         ("upside_down",), 1, 1, "", _each(lambda one, _: exchanged(on_both(one, turned)))
     ),
-    "focal length wrong": Kind(("scale_off",), 0.08, 0.3, "of it", _other_focal_length),
+    "focal length wrong": Kind(("scale_off",), 0.08, 0.3, "too long or short", _other_focal_length),
     "stamps repeated": Kind(
         ("stamps_repeated",), 1, 1, "",
         lambda window, *_: [*window.pairs[:9], window.pairs[8], *window.pairs[9:]],

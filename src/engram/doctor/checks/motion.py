@@ -16,11 +16,13 @@ _CONTRAST = 4.0
 # So many equal pairs are no robot at rest before a camera without noise.
 _LONG = 30
 # Ways are compared over stretches of this length, metres, and at least so many of them.
-_WAY_M = 3.0
+_WAY_M = 2.0
 _LEAST_WAYS = 3
-# Their median counts beyond so many standard deviations of it, and beyond one of a single way: in
-# rain all err alike.
-_SIGNIFICANT = 4.0
+# Their median counts beyond so many of its standard errors by the spread of the ways, and beyond
+# this share of what odometry claims of one way: in rain all are too short, by up to a fifth of it.
+_SIGNIFICANT, _COMMON = 3.0, 0.5
+# Standard error of the median of n normal values: times their median absolute deviation, over √n.
+_OF_MEDIAN = 1.4826 * math.sqrt(math.pi / 2)
 
 
 def without_odometry(seen: Evidence) -> float | None:
@@ -71,8 +73,11 @@ def scale_off(seen: Evidence) -> float | None:
             measured, outside, variance = nowhere
     if len(ways) < _LEAST_WAYS:
         return None
-    ratio, sigma = np.median(ways, axis=0)
-    off, unsure = float(abs(ratio - 1)), sigma * max(_SIGNIFICANT / math.sqrt(len(ways)), 1.0)
+    ratios, sigmas = np.array(ways).T
+    ratio = np.median(ratios)
+    spread = _OF_MEDIAN * float(np.median(np.abs(ratios - ratio))) / math.sqrt(len(ways))
+    unsure = max(_SIGNIFICANT * spread, _COMMON * float(np.median(sigmas)))
+    off = float(abs(ratio - 1))
     return off if max(off, seen.config.scale) > unsure else None
 
 
