@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.doctor.rematching import APART, MOST, Rematched
 from engram.doctor.settings import DoctorConfig
 from engram.doctor.sides import Alignment, SideMatches, match_sides
 from engram.frontend import Frame, FrameStatus, StereoPair
+from engram.frontend.matching import MatcherConfig
 from engram.geometry import SE3, StereoCamera
 from engram.graph.model import Clock
 from engram.odometry import Motion, OdometryStatus
@@ -85,6 +87,7 @@ class Evidence:
             before.
         bad: why other pairs were left out: an image is missing, unreadable or of another size.
         outside: each step as measured by wheels or another source; None where it was not.
+        rematched: how frames fit a map by other calibrations; of none without a map.
         alignments: of some pairs, worked out once at the end; None before.
     """
 
@@ -105,6 +108,7 @@ class Evidence:
     repeated: int = 0
     bad: list[str] = field(default_factory=list)
     outside: list[SE3 | None] = field(default_factory=list)
+    rematched: Rematched = field(default_factory=Rematched)
     alignments: list[Alignment] | None = None
 
     def __len__(self) -> int:
@@ -133,6 +137,9 @@ class Examination:
         self.evidence = Evidence(config or DoctorConfig())
         self._last: tuple[NDArray[np.uint8], NDArray[np.uint8]] | None = None
         self._begins = True
+        # Frames since the last that was matched again with a map.
+        self._unmatched = APART
+        self._tried = 0
 
     @property
     def full(self) -> bool:
@@ -176,6 +183,17 @@ class Examination:
         self._begins = False
         if isinstance(arrived, StereoPair):
             self._look(arrived, number)
+
+    def wants_match(self) -> bool:
+        """Whether the next frame should be matched again with a map; call it once a frame."""
+        self._tried, self._unmatched = self._tried + 1, self._unmatched + 1
+        few = self.evidence.rematched.frames < MOST
+        return few and self._unmatched >= APART and self._tried <= self.evidence.config.frames
+
+    def match(self, reference: Frame, live: Frame, matcher: MatcherConfig) -> None:
+        """Matches a live frame again with a frame of the map that it matched best."""
+        self.evidence.rematched.add(reference, live, matcher)
+        self._unmatched = 0
 
     def misordered(self, stamp_ns: int, last_ns: int) -> None:
         """Counts a frame that is left out for its stamp."""

@@ -135,6 +135,36 @@ CHECKS: tuple[Check, ...] = (
         needs="motion from outside, --motion TOPIC or FILE, and odometry that is sure of its steps",
     ),
     Check(
+        "focal_length_off", _WARNING, optics.focal_too_long, "scale", "of it",
+        "the focal length is too long: images fit the map better otherwise; positions are off "
+        "by metres",
+        "calibrate again; is the calibration that of images of this size?; if the map's first "
+        "drive was wrong, map it again",
+        needs="a map: engram localise tells it",
+    ),
+    Check(
+        "focal_length_off", _WARNING, optics.focal_too_short, "scale", "of it",
+        "the focal length is too short: images fit the map better otherwise; positions are off "
+        "by metres",
+        "calibrate again; is the calibration that of images of this size?; if the map's first "
+        "drive was wrong, map it again",
+        needs="a map: engram localise tells it",
+    ),
+    Check(
+        "baseline_off", _WARNING, optics.baseline_too_long, "scale", "of it",
+        "the baseline is too long: images fit the map better otherwise; so are all distances",
+        "measure the distance of the lenses with a ruler; calibrate again; if the map's first "
+        "drive was wrong, map it again",
+        needs="a map: engram localise tells it",
+    ),
+    Check(
+        "baseline_off", _WARNING, optics.baseline_too_short, "scale", "of it",
+        "the baseline is too short: images fit the map better otherwise; so are all distances",
+        "measure the distance of the lenses with a ruler; calibrate again; if the map's first "
+        "drive was wrong, map it again",
+        needs="a map: engram localise tells it",
+    ),
+    Check(
         "stamps_repeated", _WARNING, stamps.repeated, 0, "frames",
         "frames repeat the stamp of the frame before",
         "the driver sends frames twice, or the clock is too coarse; they are left out",

@@ -170,6 +170,10 @@ class Attempter:
         """Announces the nodes likely to be attempted next."""
         (self._frames if self._matcher is None else self._matcher).prefetch(nodes)
 
+    def frame(self, node: NodeId) -> Frame:
+        """The frame that was saved as a node; see `LandmarkSource`."""
+        return self._frames.frame(node)
+
     def attempt(self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate) -> Outcome:
         """The outcome of matching one candidate; see `attempts`."""
         return self.attempts(live, live_id, rank, [candidate])[0]

@@ -159,6 +159,20 @@ class Localiser:
         """Outcomes of the attempts for the last frame, in ranked order."""
         return self._outcomes
 
+    def best_matched(self) -> Frame | None:
+        """The node's frame that the last one matched best, right or not; none of its own drive."""
+        tried = [
+            one
+            for one in self._outcomes
+            if one.candidate.prediction is not None
+            and not one.damaged
+            and self._graph.node(one.candidate.index).session != self.live
+        ]
+        if not tried:
+            return None
+        best = max(tried, key=lambda one: one.match.inliers)
+        return self._attempter.frame(best.candidate.node)
+
     def attempts(self) -> list[Attempt]:
         """The last frame's attempts that had a prediction, as a map stores them (method §3.5)."""
         if self._near is None or self._reference is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import replace
 from math import inf
 from numbers import Real
@@ -111,6 +111,11 @@ class Front:
     def diagnosis(self) -> Diagnosis:
         """What the doctor finds in the first frames so far."""
         return diagnose(self.examination.evidence)
+
+    def match_again(self, live: Frame, best: Callable[[], Frame | None]) -> None:
+        """Shows the doctor a frame and what it matched best in a map, if it asks for that."""
+        if self.examination.wants_match() and (reference := best()) is not None:
+            self.examination.match(reference, live, self._settings.localiser.matcher)
 
     def take_ahead(self, arrived: Arrived, outside: OutsideMotion | None = None) -> LoggedFrame:
         """Takes a frame before the robot does, which is then given the result."""

@@ -173,8 +173,7 @@ class Robot:
             KeyboardInterrupt: Ctrl-C, once the frame is done: no motion is left out.
         """
         clock = StageClock(arrived_s)
-        if deadline_ms is None:
-            deadline_ms = self._deadline_ms
+        deadline_ms = self._deadline_ms if deadline_ms is None else deadline_ms
         if self._closed:
             raise InputError("the robot is closed; make another one with Map.robot")
         self._front.check(arrived, motion, deadline_ms)
@@ -198,6 +197,7 @@ class Robot:
                 raise
             if deadline is not None and time.perf_counter() > deadline:
                 found = replace(found, late=True)
+            self._front.match_again(frame, self._localiser.best_matched)
             self.last = Seen(arrived, frame, self._localiser.outcomes)
             if self.watch is not None:
                 self.watch(self.last, found)

@@ -19,8 +19,11 @@ _LONG = 30
 _WAY_M = 2.0
 _LEAST_WAYS = 3
 # Their median counts beyond so many of its standard errors by the spread of the ways, and beyond
-# this share of what odometry claims of one way: in rain all are too short, by up to a fifth of it.
+# this share of what odometry claims of one way.
 _SIGNIFICANT, _COMMON = 3.0, 0.5
+# In rain all ways are too short, by up to a fifth: that counts only where odometry claims to know
+# them better than this share.
+_SURE = 0.065
 # Standard error of the median of n normal values: times their median absolute deviation, over √n.
 _OF_MEDIAN = 1.4826 * math.sqrt(math.pi / 2)
 
@@ -57,7 +60,7 @@ def frozen_frames(seen: Evidence) -> float | None:
 def scale_off(seen: Evidence) -> float | None:
     """How far odometry's scale is from that of motion from outside, as a share.
 
-    None where odometry is too unsure to tell: in rain its steps are uncertain, and short.
+    None where odometry is too unsure to tell: in rain its steps are uncertain, and too short.
     """
     ways: list[tuple[float, float]] = []
     nowhere = SE3.identity(), SE3.identity(), 0.0
@@ -74,10 +77,11 @@ def scale_off(seen: Evidence) -> float | None:
     if len(ways) < _LEAST_WAYS:
         return None
     ratios, sigmas = np.array(ways).T
-    ratio = np.median(ratios)
+    ratio, sigma = float(np.median(ratios)), float(np.median(sigmas))
+    if ratio < 1 and sigma > _SURE:
+        return None
     spread = _OF_MEDIAN * float(np.median(np.abs(ratios - ratio))) / math.sqrt(len(ways))
-    unsure = max(_SIGNIFICANT * spread, _COMMON * float(np.median(sigmas)))
-    off = float(abs(ratio - 1))
+    unsure, off = max(_SIGNIFICANT * spread, _COMMON * sigma), abs(ratio - 1)
     return off if max(off, seen.config.scale) > unsure else None
 
 

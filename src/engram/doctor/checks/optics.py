@@ -31,3 +31,31 @@ def disparity_px(seen: Evidence) -> float | None:
     """Median disparity of the landmarks."""
     known = [one for one in seen.disparity_px if one > 0]
     return float(np.median(known)) if len(known) >= seen.config.least_frames else None
+
+
+def focal_too_long(seen: Evidence) -> float | None:
+    """By what share the focal length is too long, by a map."""
+    return _above(seen.rematched.focal_factor)
+
+
+def focal_too_short(seen: Evidence) -> float | None:
+    """By what share it is too short."""
+    return _below(seen.rematched.focal_factor)
+
+
+def baseline_too_long(seen: Evidence) -> float | None:
+    """By what share the baseline is too long, by a map."""
+    return _above(seen.rematched.baseline_factor)
+
+
+def baseline_too_short(seen: Evidence) -> float | None:
+    """By what share it is too short."""
+    return _below(seen.rematched.baseline_factor)
+
+
+def _above(factor: float | None) -> float | None:
+    return None if factor is None else max(factor - 1, 0.0)
+
+
+def _below(factor: float | None) -> float | None:
+    return None if factor is None else max(1 - factor, 0.0)

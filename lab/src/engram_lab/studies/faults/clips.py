@@ -202,7 +202,7 @@ REVERSED = [
 DOCTORED = [
     ClipPlan(rig, town, session, count=24)
     for rig, first in (
-        ("bicycle", 61), ("kitti", 63), ("shuttle", 65), ("wildcat", 67), ("courier", 69)
+        ("bicycle", 71), ("kitti", 73), ("shuttle", 75), ("wildcat", 77), ("courier", 79)
     )
     for town, sessions in ((first, _OTHERS[:10]), (first + 1, _OTHERS[10:]))
     for session in sessions
