@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from engram.frontend import StereoPair
 from engram.geometry import SE3
 from engram.maps import check_file
 from engram.robot import (
@@ -70,6 +71,36 @@ def test_odd_frames_are_localised_in_the_even_ones(data_dir: Path, tmp_path: Pat
         difference = node_from_live.translation - found.node_from_live.translation
         errors.append(np.linalg.norm(difference))
     assert np.median(errors) <= 0.03
+
+
+@pytest.mark.parametrize(
+    ("focal", "baseline", "codes"),
+    [
+        (1.0, 1.0, set()),
+        (1.1, 1.0, {"focal_length_off"}),
+        (0.9, 1.0, {"focal_length_off"}),
+        (1.0, 1.1, {"baseline_off"}),
+        (1.0, 0.85, {"baseline_off"}),
+    ],
+)
+def test_another_rig_is_told_by_the_map_how_wrong_its_calibration_is(
+    data_dir: Path, grey_map: Path, focal: float, baseline: float, codes: set[str]
+) -> None:
+    colour = open_drive(data_dir / DRIVE_0001, rig="colour")
+    camera = replace(
+        colour.camera,
+        fx=colour.camera.fx * focal,
+        fy=colour.camera.fy * focal,
+        baseline_m=colour.camera.baseline_m * baseline,
+    )
+    with open_map(grey_map) as opened, opened.robot(camera) as robot:
+        for pair in colour:
+            assert isinstance(pair, StereoPair)
+            robot.step(replace(pair, camera=camera))
+        found = [one for one in robot.diagnosis.findings if one.code.endswith("_off")]
+    assert {one.code for one in found} == codes
+    for one in found:
+        assert one.value == pytest.approx(abs(focal * baseline - 1), abs=0.02)
 
 
 def test_the_chained_trajectory_follows_the_truth(data_dir: Path, tmp_path: Path) -> None:

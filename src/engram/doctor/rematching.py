@@ -21,9 +21,9 @@ FACTORS: NDArray[np.float64] = np.exp(np.linspace(-1, 1, 13) * np.log(4 / 3))
 AS_IT_IS = len(FACTORS) // 2
 # So many frames are matched again, each at least so many after the one before.
 MOST, APART = 16, 8
-# Inliers tell something where the most of them stand out of the median by so many of its standard
-# deviations, counted as chance has it.
-_STANDS_OUT = 6.0
+# Inliers tell something if there are so many a frame, and stand out of their median by so many of
+# its standard deviations, as chance would have it.
+_LEAST, _STANDS_OUT = 5, 6.0
 # Another calibration fits better that has so many times the inliers, and so many standard
 # deviations more.
 _GAIN, _MORE = 1.03, 1.0
@@ -68,7 +68,8 @@ class Rematched:
         """Where the inliers are most; 1 where the calibration, or the other fault, fits better."""
         most, usual = int(inliers.max()), int(inliers[AS_IT_IS])
         chance = float(np.median([inliers, other]))
-        if max(most, int(other.max())) <= chance + _STANDS_OUT * chance**0.5:
+        least = max(_LEAST * self.frames, chance + _STANDS_OUT * chance**0.5)
+        if self.frames == 0 or max(most, int(other.max())) < least:
             return None
         better = most >= _GAIN * usual and most >= usual + _MORE * usual**0.5
         if not better or most < other.max():

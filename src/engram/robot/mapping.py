@@ -205,6 +205,7 @@ class _Mapping:
         try:
             with robot, closing(robot.drive(drive, monitor)) as found:
                 self.report.results.extend(one for one in found if not one.resumed)
+            self.report.diagnosis = front.diagnosis  # with what the map told of the calibration
             saved.finish()
         finally:
             saved.close()
