@@ -135,33 +135,35 @@ CHECKS: tuple[Check, ...] = (
         needs="motion from outside, --motion TOPIC or FILE, and odometry that is sure of its steps",
     ),
     Check(
-        "focal_length_off", _WARNING, optics.focal_too_long, "scale", "of it",
-        "the focal length is too long: images fit the map better otherwise; positions are off "
-        "by metres",
-        "calibrate again; is the calibration that of images of this size?; if the map's first "
-        "drive was wrong, map it again",
+        "focal_length_off", _WARNING, optics.focal_too_long, "scale", "of the right one",
+        "the focal length is too long: with another one images fit the map better; positions "
+        "are off by metres",
+        "calibrate again, with images of this size; if it is the map that is wrong, map its "
+        "first drives again",
         needs="a map: engram localise tells it",
     ),
     Check(
-        "focal_length_off", _WARNING, optics.focal_too_short, "scale", "of it",
-        "the focal length is too short: images fit the map better otherwise; positions are off "
-        "by metres",
-        "calibrate again; is the calibration that of images of this size?; if the map's first "
-        "drive was wrong, map it again",
+        "focal_length_off", _WARNING, optics.focal_too_short, "scale", "of the right one",
+        "the focal length is too short: with another one images fit the map better; positions "
+        "are off by metres",
+        "calibrate again, with images of this size; if it is the map that is wrong, map its "
+        "first drives again",
         needs="a map: engram localise tells it",
     ),
     Check(
-        "baseline_off", _WARNING, optics.baseline_too_long, "scale", "of it",
-        "the baseline is too long: images fit the map better otherwise; so are all distances",
-        "measure the distance of the lenses with a ruler; calibrate again; if the map's first "
-        "drive was wrong, map it again",
+        "baseline_off", _WARNING, optics.baseline_too_long, "scale", "of the right one",
+        "the baseline is too long, and with it all distances: with another one images fit the "
+        "map better",
+        "check the distance of the lenses with a ruler; calibrate again; if it is the map that is "
+        "wrong, map its first drives again",
         needs="a map: engram localise tells it",
     ),
     Check(
-        "baseline_off", _WARNING, optics.baseline_too_short, "scale", "of it",
-        "the baseline is too short: images fit the map better otherwise; so are all distances",
-        "measure the distance of the lenses with a ruler; calibrate again; if the map's first "
-        "drive was wrong, map it again",
+        "baseline_off", _WARNING, optics.baseline_too_short, "scale", "of the right one",
+        "the baseline is too short, and with it all distances: with another one images fit the "
+        "map better",
+        "check the distance of the lenses with a ruler; calibrate again; if it is the map that is "
+        "wrong, map its first drives again",
         needs="a map: engram localise tells it",
     ),
     Check(
