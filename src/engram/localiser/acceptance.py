@@ -42,6 +42,8 @@ class AcceptanceConfig:
             good.
         settle_after_m: distance along which weaker fixes must agree to be believed for good,
             metres. Until then a contradicting one withdraws them, and no edge rests on them.
+        join_after_m: the same where they would join a drive that has hung on nothing for long to
+            the rest of a map, however sure they are: streets look alike over tens of metres.
         doubt_after: fixes that should have come since the last one, and did not, after which a
             robot looks for itself all over the map; so does one that was told its place, until its
             first fix. 0: neither does, before it is lost.
@@ -71,6 +73,7 @@ class AcceptanceConfig:
     min_confidence_lost: float = 5.39
     sure_confidence: float = 7.01
     settle_after_m: float = 10.0
+    join_after_m: float = 60.0
     doubt_after: float = 3.0
     rival_share: float = 0.6
     min_inliers: int = 20

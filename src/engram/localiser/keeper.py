@@ -53,6 +53,10 @@ class Keeper:
         del certain
         return True
 
+    def joins_parts(self) -> bool:
+        """Whether a fix elsewhere in the map would join what the drive saved for long to it."""
+        return False
+
     def keep(self, live: Frame, found: Localisation) -> Localisation:
         """Keeps the result for a frame; returns it, completed by what was stored."""
         del live

@@ -35,7 +35,9 @@ class Prover:
         self._graph = graph
         self._accepted = accepted
         self._record = Record()
-        self._chain = FixChain(accepted.sure_confidence, accepted.settle_after_m)
+        self._chain = FixChain(
+            accepted.sure_confidence, accepted.settle_after_m, accepted.join_after_m
+        )
         self.standing = Standing()
         self._told = False
         self.told_otherwise = False
@@ -91,6 +93,7 @@ class Prover:
         before: Position | None,
         *,
         certain: bool,
+        joins: bool,
     ) -> None:
         """Checks a fix against those before it; the weaker of two that contradict goes.
 
@@ -100,6 +103,7 @@ class Prover:
             found: the position by it.
             before: the position before it; None if unknown.
             certain: whether odometry since the last match had only short gaps.
+            joins: whether a fix that nothing predicts joins two parts of the map.
         """
         evidence = success.evidence
         assert evidence is not None
@@ -107,8 +111,9 @@ class Prover:
         before = self._chain.position or before
         fits = True if predicted else self._agrees(found, before if certain else None)
         alone = confidence_of(live.descriptor).alone(evidence)
-        if fits is False or not self.standing.agreed:
-            withdraws = self._chain.begin(live.stamp_ns, found, alone)
+        joins = joins and fits is not True
+        if fits is False or joins or not self.standing.agreed:
+            withdraws = self._chain.begin(live.stamp_ns, found, alone, joins=joins)
             self.withdraws = withdraws if fits is False else ()
         else:
             self._chain.join(live.stamp_ns, found, alone)

@@ -19,7 +19,7 @@ from engram.ranking.lessons import LessonsConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 17
+METHOD_VERSION = 18
 
 
 class NeighbourhoodSearch(StrEnum):

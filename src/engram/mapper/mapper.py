@@ -43,6 +43,8 @@ class MapperConfig:
         sure_inliers: a frame that matched with fewer inliers is saved all the same: the place has
             come to look different, and frames that match this one need not match its old nodes. 0
             saves none of them, as published. Source: lab/reports/constants.md.
+        alone_m: a drive that has hung on nothing for this long joins the map only where fixes agree
+            along `localiser.acceptance.join_after_m`, metres.
         tie_within_m: a new experience is also tied to the session's last saved node within this
             distance, metres. Source: the search radius, method §3.
         checkpoint_every: live frames between two checkpoints of the map.
@@ -55,6 +57,7 @@ class MapperConfig:
     save_every_m: float = 1.0
     save_every_rad: float = float(np.deg2rad(15.0))
     sure_inliers: int = 60
+    alone_m: float = 100.0
     tie_within_m: float = 8.0
     checkpoint_every: int = 20
     memory_bytes: int = 256_000_000
@@ -62,7 +65,7 @@ class MapperConfig:
     proximity: ProximityConfig = field(default_factory=ProximityConfig)
 
     def __post_init__(self) -> None:
-        for name in ("save_every_m", "save_every_rad", "tie_within_m"):
+        for name in ("save_every_m", "save_every_rad", "alone_m", "tie_within_m"):
             value = getattr(self, name)
             if not 0 <= value < np.inf:
                 raise ConfigError(f"mapper: {name} is {value}, must be finite and >= 0")
@@ -104,8 +107,10 @@ class Mapper(Memory):
         super().__init__(localiser, saver, path_id(session.id), stored)
         self.config = config or MapperConfig()
         self._loops = loops
-        # Whether the nodes being saved are connected to the rest of the map.
+        # Whether the nodes being saved are connected to the rest of the map, and the way driven
+        # when they last were not.
         self._joined = bool((graph.sessions == graph.session_number(session.id)).all())
+        self._alone_from_m = localiser.driven_m
         self._graph = graph
         self._session = session
         # The last saved node and the motion since, while that is known.
@@ -140,6 +145,11 @@ class Mapper(Memory):
     def may_propose_own(self, *, certain: bool) -> bool:
         """See `Keeper`."""
         return not certain or self._loops is None
+
+    def joins_parts(self) -> bool:
+        """See `Keeper`."""
+        alone_m = self._localiser.driven_m - self._alone_from_m
+        return not self._joined and alone_m > self.config.alone_m
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:
         """Saves a frame that did not match, or weakly; ties experiences to their neighbours.
@@ -272,6 +282,7 @@ class Mapper(Memory):
         unknown = self._localiser.told_otherwise
         if self._since_saved is None or unknown:
             self._joined = len(self._graph) == 1  # motion from earlier nodes is unknown
+            self._alone_from_m = self._localiser.driven_m
         if self._experience and self._since_saved is not None:
             edges.append(_edge(self._since_saved, node.id, EdgeKind.ODOMETRY))
         elif not self._experience and position is not None and self._localiser.certain:

@@ -1,0 +1,62 @@
+"""A drive that has hung on nothing for long joins a map only where fixes agree along some way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.mapping_rig import map_simulated
+from tests.synthetic_world import PERIOD_NS, Seen, World, drive
+
+from engram.geometry import SE3
+from engram.maps import Map
+from engram.odometry import OdometryStatus, OdometryStep
+
+STEP_M = 0.7
+# A street that was mapped, and others that are like nothing.
+STREET, ELSEWHERE, BEYOND = World(90.0), World(130.0, seed=7), World(40.0, seed=8)
+
+
+def along(world: World, length_m: float) -> list[Seen]:
+    return drive(world, np.arange(0.0, length_m, STEP_M), seed=1)
+
+
+def one_after_another(*parts: list[Seen]) -> list[Seen]:
+    """One drive through all of them, straight ahead."""
+    ahead = SE3(np.eye(3), np.array([0, 0, STEP_M]))
+    covariance = np.diag([0.01**2] * 3 + [0.002**2] * 3)
+    on = OdometryStep(OdometryStatus.OK, ahead, covariance, 100)
+    whole = []
+    for part in parts:
+        for number, seen in enumerate(part):
+            stamp_ns = 10**15 + len(whole) * PERIOD_NS
+            odometry = on if whole and number == 0 else seen.odometry
+            frame = replace(seen.frame, stamp_ns=stamp_ns)
+            whole.append(replace(seen, frame=frame, odometry=odometry))
+    return whole
+
+
+def parts_after(path: Path, *parts: list[Seen]) -> int:
+    """Parts of the map of the street after a drive through other streets and a part of it."""
+    map_simulated(path, along(STREET, 88.0))
+    map_simulated(path, one_after_another(*parts), name="r2", rounds=4)
+    with Map.open(path) as opened:
+        return len(np.unique(opened.graph.components()))
+
+
+@pytest.mark.parametrize(
+    ("alone_m", "alike_m", "parts"),
+    [
+        (120.0, 40.0, 2),  # alike for a while: nothing is joined
+        (120.0, 86.0, 1),  # the street itself
+        (20.0, 40.0, 1),  # a drive that has just begun joins as soon as fixes prove each other
+    ],
+)
+def test_a_long_drive_that_hung_on_nothing_joins_where_fixes_agree_along_the_way(
+    tmp_path: Path, alone_m: float, alike_m: float, parts: int
+) -> None:
+    path = tmp_path / "street.engram"
+    before, alike, after = along(ELSEWHERE, alone_m), along(STREET, alike_m), along(BEYOND, 38.0)
+    assert parts_after(path, before, alike, after) == parts
