@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from uuid import UUID
 
 import numpy as np
@@ -64,3 +65,20 @@ def test_the_spread_of_a_strong_match_is_not_asked_for() -> None:
         matches = Matches(inliers, WIDE)
         assert attempted(matches).accepted
         assert matches.asked == asked
+
+
+def test_a_robot_that_is_lost_for_long_believes_only_what_is_sure() -> None:
+    acceptance = LocaliserConfig().acceptance
+    frame = see(WORLD, WORLD.pose_at(5.0), 1)
+    lost = Candidate(0, NODE, None, guided=False, row=None)
+    found = {}
+    for inliers in range(30, 400, 5):
+        attempter = Attempter(None, LocaliserConfig(), Matches(inliers, WIDE))  # type: ignore[arg-type]
+        soon = attempter.attempt(frame, LIVE, 0, lost)
+        late = attempter.attempt(frame, LIVE, 0, replace(lost, lost_long=True))
+        assert soon.confidence == late.confidence
+        assert soon.accepted == (soon.confidence >= acceptance.min_confidence_lost)
+        assert late.accepted == (late.confidence >= acceptance.sure_confidence)
+        found[inliers] = soon.accepted, late.accepted
+    assert (True, False) in found.values()
+    assert (True, True) in found.values()

@@ -38,6 +38,9 @@ class AcceptanceConfig:
         min_confidence_told: the same where no fix has confirmed the position yet: it may have been
             told wrong, and streets look alike.
         min_confidence_lost: the same of a match that nothing predicts: many such are tried.
+        lost_long_m: distance without a match beyond which a lost robot believes only a match of
+            `sure_confidence`, metres: the further it drives, the more places that look alike it
+            has tried, and the less likely it is that the map shows the road at all.
         sure_confidence: log-odds of one fix, without those before it, from which it is believed for
             good.
         settle_after_m: distance along which weaker fixes must agree to be believed for good,
@@ -71,6 +74,7 @@ class AcceptanceConfig:
     min_confidence: float = 4.25
     min_confidence_told: float = 4.74
     min_confidence_lost: float = 5.39
+    lost_long_m: float = 100.0
     sure_confidence: float = 7.01
     settle_after_m: float = 10.0
     join_after_m: float = 60.0

@@ -59,6 +59,7 @@ class Candidate:
         doubted: whether the prediction may be wrong: the robot is lost, and has no nodes of its
             own that confirm its position.
         standing: how far the robot's position can be relied on.
+        lost_long: whether the robot has driven far without a match; see `lost_long_m`.
     """
 
     index: int
@@ -68,6 +69,7 @@ class Candidate:
     row: int | None
     doubted: bool = False
     standing: Standing = UNKNOWN
+    lost_long: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -282,7 +284,8 @@ class Attempter:
         if match.inliers < acceptance.min_inliers or not determined(match, acceptance):
             return False, False
         predicted, anywhere = readings
-        over = anywhere - acceptance.min_confidence_lost
+        least = acceptance.min_confidence_lost
+        over = anywhere - (max(acceptance.sure_confidence, least) if candidate.lost_long else least)
         if confirmed:
             over = max(over, predicted - acceptance.min_confidence)
             return over >= 0, over >= -witness

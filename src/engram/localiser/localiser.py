@@ -168,10 +168,8 @@ class Localiser:
             and not one.damaged
             and self._graph.node(one.candidate.index).session != self.live
         ]
-        if not tried:
-            return None
-        best = max(tried, key=lambda one: one.match.inliers)
-        return self._attempter.frame(best.candidate.node)
+        best = max(tried, key=lambda one: one.match.inliers, default=None)
+        return None if best is None else self._attempter.frame(best.candidate.node)
 
     def attempts(self) -> list[Attempt]:
         """The last frame's attempts that had a prediction, as a map stores them (method §3.5)."""
@@ -357,6 +355,10 @@ class Localiser:
         return not self.certain or self._open_loop_m > self.config.lost_after_m
 
     @property
+    def _lost_long(self) -> bool:
+        return self._open_loop_m > self.config.acceptance.lost_long_m
+
+    @property
     def _looks_elsewhere(self) -> bool:
         return self._lost or self._prover.doubted
 
@@ -467,6 +469,7 @@ class Localiser:
                 guided=False,
                 row=None,
                 standing=self._prover.standing,
+                lost_long=self._lost_long,
             )
             for index in dict.fromkeys(indices)
             if index not in known | self._damaged
@@ -507,7 +510,7 @@ class Localiser:
         # A mapping robot knows its position by its own nodes; loop closure has stricter tests.
         doubted = self._looks_elsewhere and not (self.certain and self._own_session is not None)
         node, standing = self._graph.node(index).id, self._prover.standing
-        return Candidate(index, node, prediction, guided, row, doubted, standing)
+        return Candidate(index, node, prediction, guided, row, doubted, standing, self._lost_long)
 
     def _judged(self, live: Frame, outcomes: list[Outcome]) -> list[Outcome]:
         """Outcomes of readable nodes, with those accepted that an earlier match confirms.
