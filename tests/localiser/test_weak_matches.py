@@ -42,11 +42,14 @@ class Matches:
         raise AssertionError("nothing is announced here")
 
 
-def attempted(matches: Matches) -> Outcome:
+NEAR = Candidate(
+    0, NODE, Prediction(SE3.identity(), 0.1, 0.01), guided=True, row=0, standing=CONFIRMED
+)
+LOST = Candidate(0, NODE, None, guided=False, row=None)
+
+
+def attempted(matches: Matches, candidate: Candidate = NEAR) -> Outcome:
     frame = see(WORLD, WORLD.pose_at(5.0), 1)
-    candidate = Candidate(
-        0, NODE, Prediction(SE3.identity(), 0.1, 0.01), guided=True, row=0, standing=CONFIRMED
-    )
     attempter = Attempter(None, LocaliserConfig(), matches)  # type: ignore[arg-type]
     return attempter.attempt(frame, LIVE, 0, candidate)
 
@@ -69,13 +72,10 @@ def test_the_spread_of_a_strong_match_is_not_asked_for() -> None:
 
 def test_a_robot_that_is_lost_for_long_believes_only_what_is_sure() -> None:
     acceptance = LocaliserConfig().acceptance
-    frame = see(WORLD, WORLD.pose_at(5.0), 1)
-    lost = Candidate(0, NODE, None, guided=False, row=None)
     found = {}
     for inliers in range(30, 400, 5):
-        attempter = Attempter(None, LocaliserConfig(), Matches(inliers, WIDE))  # type: ignore[arg-type]
-        soon = attempter.attempt(frame, LIVE, 0, lost)
-        late = attempter.attempt(frame, LIVE, 0, replace(lost, lost_long=True))
+        soon = attempted(Matches(inliers, WIDE), LOST)
+        late = attempted(Matches(inliers, WIDE), replace(LOST, lost_long=True))
         assert soon.confidence == late.confidence
         assert soon.accepted == (soon.confidence >= acceptance.min_confidence_lost)
         assert late.accepted == (late.confidence >= acceptance.sure_confidence)

@@ -139,7 +139,7 @@ class Examination:
         self._begins = True
         # Frames since the last that was matched again with a map.
         self._unmatched = APART
-        self._tried = 0
+        self._asked = 0
 
     @property
     def full(self) -> bool:
@@ -186,9 +186,9 @@ class Examination:
 
     def wants_match(self) -> bool:
         """Whether the next frame should be matched again with a map; call it once a frame."""
-        self._tried, self._unmatched = self._tried + 1, self._unmatched + 1
+        self._asked, self._unmatched = self._asked + 1, self._unmatched + 1
         few = self.evidence.rematched.frames < MOST
-        return few and self._unmatched >= APART and self._tried <= self.evidence.config.frames
+        return few and self._unmatched >= APART and self._asked <= self.evidence.config.frames
 
     def match(self, reference: Frame, live: Frame, matcher: MatcherConfig) -> None:
         """Matches a live frame again with a frame of the map that it matched best."""

@@ -40,7 +40,8 @@ class DoctorConfig:
             variance.
         least_px_per_deg: pixels per degree at the middle of the image.
         least_disparity_px: median disparity of the landmarks, px: below it depth is a guess.
-        scale: difference of odometry's scale from that of motion from outside or a map.
+        scale: difference of odometry's scale from that of motion from outside, and of focal length
+            or baseline from what fits a map, as a share.
         bits: bits of the brightest pixel of 16-bit images.
         other_size: distance of the principal point from the middle, both down and right, or both
             up and left, in half images. Real calibrations stay below 0.1; half images with the

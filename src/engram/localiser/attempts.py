@@ -172,9 +172,12 @@ class Attempter:
         """Announces the nodes likely to be attempted next."""
         (self._frames if self._matcher is None else self._matcher).prefetch(nodes)
 
-    def frame(self, node: NodeId) -> Frame:
-        """The frame that was saved as a node; see `LandmarkSource`."""
-        return self._frames.frame(node)
+    def frame(self, node: NodeId) -> Frame | None:
+        """The frame that was saved as a node; None if it is damaged."""
+        try:
+            return self._frames.frame(node)
+        except MapCorruptError:
+            return None
 
     def attempt(self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate) -> Outcome:
         """The outcome of matching one candidate; see `attempts`."""
@@ -209,9 +212,8 @@ class Attempter:
     def _question(self, live_id: NodeId, candidate: Candidate) -> Question | None:
         """What the live frame is matched with; None if the node is damaged."""
         config = self._lost_config if candidate.prediction is None else self._config
-        try:
-            reference = self._frames.frame(candidate.node)
-        except MapCorruptError:
+        reference = self.frame(candidate.node)
+        if reference is None:
             return None
         guide = candidate.prediction if candidate.guided else None
         seed = pair_seed(live_id, candidate.node)

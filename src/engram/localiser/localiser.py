@@ -536,8 +536,8 @@ class Localiser:
         assert node_from_live is not None
         assert covariance is not None
         found = Position(success.candidate.node, node_from_live, covariance)
-        known = self.certain
-        self._prover.prove(live, success, found, self.position, certain=known, joins=joins)
+        certain = self.certain
+        self._prover.prove(live, success, found, self.position, certain=certain, joins=joins)
         self.position = found
         self._open_loop_m = 0.0
         self._guessed_m2 = 0.0

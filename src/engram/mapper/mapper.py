@@ -108,7 +108,7 @@ class Mapper(Memory):
         self.config = config or MapperConfig()
         self._loops = loops
         # Whether the nodes being saved are connected to the rest of the map, and the way driven
-        # when they last were not.
+        # when the part that may not be began.
         self._joined = bool((graph.sessions == graph.session_number(session.id)).all())
         self._alone_from_m = localiser.driven_m
         self._graph = graph

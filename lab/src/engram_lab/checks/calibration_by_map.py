@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from engram.doctor import DoctorConfig
 from engram.frontend import BRIEF, DescriptorKind
 from engram.geometry import StereoCamera
 from engram.monitor import QUIET
@@ -134,7 +133,7 @@ def main() -> None:
     parser.add_argument("--kind", type=DescriptorKind, default=BRIEF, help="of features")
     parser.add_argument("--towns", type=numbers, default=list(HELD_OUT_TOWNS))
     asked = parser.parse_args()
-    settings = replace(Settings().for_descriptor(asked.kind), doctor=DoctorConfig())
+    settings = Settings().for_descriptor(asked.kind)
     report(figures(list(all_judged(asked.towns, settings))), asked.json, "calibration by the map")
 
 
