@@ -13,7 +13,7 @@ from engram.frontend import BRIEF, Frame
 from engram.frontend.matching import Match
 from engram.geometry import SE3
 from engram.graph.model import NodeId
-from engram.localiser import LocaliserConfig, Prediction, Spread
+from engram.localiser import LocaliserConfig, Prediction, Rule, Spread
 from engram.localiser.attempts import Attempter, Candidate, Outcome
 from engram.localiser.confidence import Standing, confidence_of
 
@@ -82,3 +82,79 @@ def test_a_robot_that_is_lost_for_long_believes_only_what_is_sure() -> None:
         found[inliers] = soon.accepted, late.accepted
     assert (True, False) in found.values()
     assert (True, True) in found.values()
+
+
+class Searches:
+    """What a wide search finds, and what a narrow one: so many inliers, so far off."""
+
+    def __init__(self, wide: tuple[int, float], narrow: tuple[int, float]) -> None:
+        self._found = {"wide": wide, "narrow": narrow}
+        self.asked: list[str] = []
+
+    def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
+        config = LocaliserConfig()
+        sigmas = None if guide is None else (guide.sigma_m, guide.sigma_yaw_rad)
+        narrow = sigmas == (config.narrow_m, config.narrow_rad)
+        self.asked.append("narrow" if narrow else "wide")
+        inliers, off_m = self._found[self.asked[-1]]
+        rows = np.arange(inliers, dtype=np.int32)
+        pose = SE3(np.eye(3), np.array([off_m, 0.0, 0.0]))
+        return Match(pose, 1e-4 * np.eye(6), inliers, rows, rows)
+
+    def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
+        return WIDE
+
+    def prefetch(self, nodes: list[NodeId]) -> None:
+        raise AssertionError("nothing is announced here")
+
+
+EXPECTED = replace(NEAR, prediction=Prediction(SE3.identity(), 0.4, 0.02))
+
+
+def found(
+    searches: Searches, candidate: Candidate = EXPECTED, rule: Rule = Rule.CONFIDENCE
+) -> tuple[int, float]:
+    frame, config = see(WORLD, WORLD.pose_at(5.0), 1), LocaliserConfig()
+    config = replace(config, acceptance=replace(config.acceptance, rule=rule))
+    attempter = Attempter(None, config, searches)  # type: ignore[arg-type]
+    match = attempter.attempt(frame, LIVE, 0, candidate).match
+    assert match.reference_from_live is not None
+    return match.inliers, float(match.reference_from_live.translation[0])
+
+
+@pytest.mark.parametrize(
+    ("wide", "narrow", "better"),
+    [
+        ((25, 1.2), (25, 0.1), True),
+        ((25, 1.2), (31, 0.1), True),
+        ((25, 1.2), (24, 0.1), False),
+        ((25, 1.2), (40, 1.3), False),
+        ((15, 0.2), (21, 0.1), True),
+        ((15, 0.2), (14, 0.1), False),
+    ],
+    ids=["as many", "more", "fewer", "no nearer", "weak: more", "weak: fewer"],
+)
+def test_what_is_weak_or_far_from_its_prediction_is_sought_near_it(
+    wide: tuple[int, float], narrow: tuple[int, float], better: bool
+) -> None:
+    searches = Searches(wide, narrow)
+    assert found(searches) == (narrow if better else wide)
+    assert searches.asked == ["wide", "narrow"]
+
+
+@pytest.mark.parametrize(
+    ("wide", "candidate", "rule"),
+    [
+        ((25, 0.4), EXPECTED, Rule.CONFIDENCE),
+        ((11, 0.4), EXPECTED, Rule.CONFIDENCE),
+        ((25, 1.2), replace(EXPECTED, guided=False), Rule.CONFIDENCE),
+        ((25, 1.2), replace(EXPECTED, standing=Standing()), Rule.CONFIDENCE),
+        ((25, 1.2), LOST, Rule.CONFIDENCE),
+        ((25, 1.2), EXPECTED, Rule.INLIERS),
+    ],
+    ids=["near and strong", "of no worth", "vague", "unconfirmed", "lost", "published rule"],
+)
+def test_one_search_is_enough(wide: tuple[int, float], candidate: Candidate, rule: Rule) -> None:
+    searches = Searches(wide, (90, 0.0))
+    assert found(searches, candidate, rule) == wide
+    assert searches.asked == ["wide"]

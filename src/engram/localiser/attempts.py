@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Protocol
 
@@ -162,6 +162,7 @@ class Attempter:
         self._config = config.matcher
         self._lost_config = config.lost_matcher
         self._acceptance = config.acceptance
+        self._narrow = config.narrow_m, config.narrow_rad
         self._matcher = matcher
 
     def close(self) -> None:
@@ -204,10 +205,47 @@ class Attempter:
             matches = [None if one is None else next(found) for one in questions]
         else:
             matches = [self._of_matcher(live, live_id, candidate) for candidate in candidates]
+        best = [
+            self._sought_closely(live, live_id, candidate, match)
+            for candidate, match in zip(candidates, matches, strict=True)
+        ]
         return [
             self._judged(live, live_id, rank + at, candidate, match)
-            for at, (candidate, match) in enumerate(zip(candidates, matches, strict=True))
+            for at, (candidate, match) in enumerate(zip(candidates, best, strict=True))
         ]
+
+    def _sought_closely(
+        self, live: Frame, live_id: NodeId, candidate: Candidate, match: Match | None
+    ) -> Match | None:
+        """The match, or one close to its prediction on which as many landmarks agree or more.
+
+        Of few landmarks that are right, a wide search may miss the pose that most of them agree on:
+        in rain it ends a metre off with 20 to 35 inliers, where a narrow one finds as many at the
+        right place. So where fixes confirm the prediction, what is weak or far from it is sought
+        once more. The published rule makes one search.
+        """
+        prediction, acceptance = candidate.prediction, self._acceptance
+        if match is None or match.reference_from_live is None or match.inliers < _LEAST_WEIGHED:
+            return match
+        confirmed = candidate.guided and candidate.standing.agreed > 0
+        if prediction is None or not confirmed or acceptance.rule is Rule.INLIERS:
+            return match
+        weak = match.inliers < acceptance.min_inliers
+        far_m = _apart_m(match, prediction)
+        if not weak and far_m <= acceptance.slack_m:
+            return match
+        narrow = Prediction(prediction.node_from_live, *self._narrow)
+        closer = self._matched(live, live_id, replace(candidate, prediction=narrow))
+        if closer is None or closer.inliers < match.inliers:
+            return match
+        return closer if weak or _apart_m(closer, prediction) < far_m else match
+
+    def _matched(self, live: Frame, live_id: NodeId, candidate: Candidate) -> Match | None:
+        """One more match; None if the node is damaged."""
+        if self._matcher is not None:
+            return self._of_matcher(live, live_id, candidate)
+        question = self._question(live_id, candidate)
+        return None if question is None else self._lanes.match(live, [question])[0]
 
     def _question(self, live_id: NodeId, candidate: Candidate) -> Question | None:
         """What the live frame is matched with; None if the node is damaged."""
@@ -320,6 +358,11 @@ def _expected(guide: Prediction | None) -> tuple[SE3 | None, NDArray[np.float64]
     covariance = np.zeros((6, 6))
     covariance.flat[:21:7], covariance.flat[21::7] = guide.sigma_m**2, guide.sigma_yaw_rad**2
     return guide.node_from_live, covariance
+
+
+def _apart_m(match: Match, prediction: Prediction) -> float:
+    assert match.reference_from_live is not None
+    return (prediction.node_from_live.inverse() @ match.reference_from_live).distance_m
 
 
 def up_to_first_success(outcomes: Sequence[Outcome]) -> list[Outcome]:

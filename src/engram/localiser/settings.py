@@ -19,7 +19,7 @@ from engram.ranking.lessons import LessonsConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 18
+METHOD_VERSION = 19
 
 
 class NeighbourhoodSearch(StrEnum):
@@ -90,6 +90,8 @@ class LocaliserConfig:
             speaks for places of a lost robot is carried on.
         guide_below_m, guide_below_rad: the prediction guides an attempt if its standard deviations
             are below both; 0 turns guidance off. Source: `lab/reports/constants.md`.
+        narrow_m, narrow_rad: standard deviations of a second search near the prediction, where the
+            first ends with few inliers or far from it. Source: `lab/reports/trust.md`.
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
             They keep 98.7 % of the matches it would accept. Source: `lab/reports/constants.md`.
         neighbourhood, path_entries, success, lens_depth_m, fix_sigmas: see their descriptions.
@@ -108,6 +110,8 @@ class LocaliserConfig:
     followed_gap_m: float = 1.0
     guide_below_m: float = 0.6
     guide_below_rad: float = float(np.deg2rad(4.0))
+    narrow_m: float = 0.1
+    narrow_rad: float = 0.01
     lost_max_samples: int = 256
     lost_max_hypotheses: int = 100
     neighbourhood: Annotated[
