@@ -159,16 +159,17 @@ def test_what_contradicts_fixes_on_trial_names_them() -> None:
 
 
 def test_what_joins_two_parts_of_a_map_has_to_agree_for_longer_however_sure_it_is() -> None:
-    chain = FixChain(sure_confidence=12.0, settle_after_m=10.0, join_after_m=60.0)
-    chain.begin(1, at(0.0), 13.0, joins=True)
+    chain = FixChain(sure_confidence=12.0, settle_after_m=10.0)
+    chain.begin(1, at(0.0), 13.0, joins_after_m=60.0)
     drive(chain, 50.0)
     chain.join(2, at(50.0), 13.0)
     assert chain.on_trial
     drive(chain, 11.0)
     chain.join(3, at(61.0), 6.0)
     assert not chain.on_trial
-    chain.begin(4, at(0.0), 13.0)
-    assert not chain.on_trial
+    for soon in (0.0, 9.0):
+        chain.begin(4, at(0.0), 13.0, joins_after_m=soon)
+        assert not chain.on_trial
 
 
 def test_a_trial_ends_where_nothing_comes() -> None:

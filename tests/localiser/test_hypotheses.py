@@ -15,6 +15,7 @@ from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.localiser import AcceptanceConfig, Position
 from engram.localiser.attempts import Candidate, Outcome
 from engram.localiser.hypotheses import Hypotheses
+from engram.localiser.settings import HypothesesConfig
 
 SESSION = SessionId(UUID(int=1))
 SURE = 1e-6 * np.eye(6)
@@ -51,9 +52,11 @@ def waiting() -> Hypotheses:
     return Hypotheses(GRAPH, near, AcceptanceConfig())
 
 
-def seen_from(node: int, metres: float, rank: int = 0) -> Outcome:
+def seen_from(node: int, metres: float, rank: int = 0, *, lost_long: bool = False) -> Outcome:
     """A plausible match with a node, from so far beyond it."""
-    candidate = Candidate(node, GRAPH.node(node).id, None, guided=False, row=None)
+    candidate = Candidate(
+        node, GRAPH.node(node).id, None, guided=False, row=None, lost_long=lost_long
+    )
     match = Match(ahead(metres), SURE, 40, NOTHING, NOTHING)
     return Outcome(candidate, rank, match, accepted=False, plausible=True)
 
@@ -123,3 +126,29 @@ def test_it_is_forgotten_in_time() -> None:
 def test_where_a_match_was_accepted_by_itself_nothing_is_to_do() -> None:
     outcomes = [replace(seen_from(10, 0.5), accepted=True), seen_from(40, 0.0, rank=1)]
     assert waiting().judge(outcomes) is outcomes
+
+
+def long_lost(every_m: int, length_m: int) -> int | None:
+    """The node at which a robot that has long been lost is believed, by a match every so often."""
+    hypotheses = waiting()
+    for metres in range(0, length_m, every_m):
+        if metres:
+            drive(hypotheses, float(every_m))
+        if found := accepted(hypotheses.judge([seen_from(metres, 0.0, lost_long=True)])):
+            return found[0]
+    return None
+
+
+def test_a_robot_that_is_long_lost_is_found_where_matches_agree_along_the_way() -> None:
+    needed_m = HypothesesConfig().long_base_line_m
+    for every_m in (1, 5, 10):
+        found = long_lost(every_m, 59)
+        assert found is not None
+        assert needed_m <= found < needed_m + every_m
+    assert long_lost(5, int(needed_m)) is None
+    assert long_lost(20, 59) is None  # each was forgotten before the next
+
+
+def test_one_sure_match_is_enough_for_it_even_so() -> None:
+    sure = replace(seen_from(10, 0.5, lost_long=True), accepted=True)
+    assert accepted(waiting().judge([sure])) == [10]

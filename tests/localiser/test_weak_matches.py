@@ -13,7 +13,7 @@ from engram.frontend import BRIEF, Frame
 from engram.frontend.matching import Match
 from engram.geometry import SE3
 from engram.graph.model import NodeId
-from engram.localiser import LocaliserConfig, Prediction, Rule, Spread
+from engram.localiser import AcceptanceConfig, LocaliserConfig, Prediction, Rule, Spread
 from engram.localiser.attempts import Attempter, Candidate, Outcome
 from engram.localiser.confidence import Standing, confidence_of
 
@@ -112,10 +112,9 @@ EXPECTED = replace(NEAR, prediction=Prediction(SE3.identity(), 0.4, 0.02))
 
 
 def found(
-    searches: Searches, candidate: Candidate = EXPECTED, rule: Rule = Rule.CONFIDENCE
+    searches: Searches, candidate: Candidate = EXPECTED, config: LocaliserConfig | None = None
 ) -> tuple[int, float]:
-    frame, config = see(WORLD, WORLD.pose_at(5.0), 1), LocaliserConfig()
-    config = replace(config, acceptance=replace(config.acceptance, rule=rule))
+    frame, config = see(WORLD, WORLD.pose_at(5.0), 1), config or LocaliserConfig()
     attempter = Attempter(None, config, searches)  # type: ignore[arg-type]
     match = attempter.attempt(frame, LIVE, 0, candidate).match
     assert match.reference_from_live is not None
@@ -142,19 +141,28 @@ def test_what_is_weak_or_far_from_its_prediction_is_sought_near_it(
     assert searches.asked == ["wide", "narrow"]
 
 
+PUBLISHED = LocaliserConfig(acceptance=AcceptanceConfig(rule=Rule.INLIERS))
+
+
+@pytest.mark.parametrize("config", [PUBLISHED, LocaliserConfig(narrow_m=0.0)], ids=["[L15]", "off"])
+def test_the_published_rule_makes_one_search(config: LocaliserConfig) -> None:
+    searches = Searches((25, 1.2), (90, 0.0))
+    assert found(searches, config=config) == (25, 1.2)
+    assert searches.asked == ["wide"]
+
+
 @pytest.mark.parametrize(
-    ("wide", "candidate", "rule"),
+    ("wide", "candidate"),
     [
-        ((25, 0.4), EXPECTED, Rule.CONFIDENCE),
-        ((11, 0.4), EXPECTED, Rule.CONFIDENCE),
-        ((25, 1.2), replace(EXPECTED, guided=False), Rule.CONFIDENCE),
-        ((25, 1.2), replace(EXPECTED, standing=Standing()), Rule.CONFIDENCE),
-        ((25, 1.2), LOST, Rule.CONFIDENCE),
-        ((25, 1.2), EXPECTED, Rule.INLIERS),
+        ((25, 0.4), EXPECTED),
+        ((11, 0.4), EXPECTED),
+        ((25, 1.2), replace(EXPECTED, guided=False)),
+        ((25, 1.2), replace(EXPECTED, standing=Standing())),
+        ((25, 1.2), LOST),
     ],
-    ids=["near and strong", "of no worth", "vague", "unconfirmed", "lost", "published rule"],
+    ids=["near and strong", "of no worth", "vague", "unconfirmed", "lost"],
 )
-def test_one_search_is_enough(wide: tuple[int, float], candidate: Candidate, rule: Rule) -> None:
+def test_one_search_is_enough(wide: tuple[int, float], candidate: Candidate) -> None:
     searches = Searches(wide, (90, 0.0))
-    assert found(searches, candidate, rule) == wide
+    assert found(searches, candidate) == wide
     assert searches.asked == ["wide"]

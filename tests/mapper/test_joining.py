@@ -1,4 +1,4 @@
-"""A drive that has hung on nothing for long joins a map only where fixes agree along some way."""
+"""A drive that has hung on nothing joins a map only where fixes agree along as much way."""
 
 from __future__ import annotations
 
@@ -51,10 +51,11 @@ def parts_after(path: Path, *parts: list[Seen]) -> int:
     [
         (120.0, 40.0, 2),  # alike for a while: nothing is joined
         (120.0, 86.0, 1),  # the street itself
-        (20.0, 40.0, 1),  # a drive that has just begun joins as soon as fixes prove each other
+        (60.0, 40.0, 2),
+        (20.0, 40.0, 1),  # a drive that has just begun joins along as much way as it was alone
     ],
 )
-def test_a_long_drive_that_hung_on_nothing_joins_where_fixes_agree_along_the_way(
+def test_a_drive_that_hung_on_nothing_joins_where_fixes_agree_along_as_much_way(
     tmp_path: Path, alone_m: float, alike_m: float, parts: int
 ) -> None:
     path = tmp_path / "street.engram"

@@ -45,8 +45,9 @@ class AcceptanceConfig:
             good.
         settle_after_m: distance along which weaker fixes must agree to be believed for good,
             metres. Until then a contradicting one withdraws them, and no edge rests on them.
-        join_after_m: the same where they would join a drive that has hung on nothing for long to
-            the rest of a map, however sure they are: streets look alike over tens of metres.
+        join_after_m: where they would join a drive to the rest of a map, they must agree along as
+            much way as it has hung on nothing, however sure they are, but no more than this,
+            metres: streets look alike over tens of metres.
         doubt_after: fixes that should have come since the last one, and did not, after which a
             robot looks for itself all over the map; so does one that was told its place, until its
             first fix. 0: neither does, before it is lost.

@@ -228,7 +228,8 @@ class Attempter:
         if match is None or match.reference_from_live is None or match.inliers < _LEAST_WEIGHED:
             return match
         confirmed = candidate.guided and candidate.standing.agreed > 0
-        if prediction is None or not confirmed or acceptance.rule is Rule.INLIERS:
+        once = acceptance.rule is Rule.INLIERS or not self._narrow[0]
+        if prediction is None or not confirmed or once:
             return match
         weak = match.inliers < acceptance.min_inliers
         far_m = _apart_m(match, prediction)
@@ -324,12 +325,15 @@ class Attempter:
         if match.inliers < acceptance.min_inliers or not determined(match, acceptance):
             return False, False
         predicted, anywhere = readings
-        least = acceptance.min_confidence_lost
-        over = anywhere - (max(acceptance.sure_confidence, least) if candidate.lost_long else least)
-        if confirmed:
-            over = max(over, predicted - acceptance.min_confidence)
-            return over >= 0, over >= -witness
-        return max(over, predicted - acceptance.min_confidence_told) >= 0, over >= -witness
+        least = sure = acceptance.min_confidence_lost
+        if candidate.lost_long:
+            sure = max(acceptance.sure_confidence, least)
+        over = anywhere - least
+        near = predicted - (
+            acceptance.min_confidence if confirmed else acceptance.min_confidence_told
+        )
+        waits = over >= -witness or (confirmed and near >= -witness)
+        return max(anywhere - sure, near) >= 0, waits
 
     def _counted(
         self, candidate: Candidate, match: Match, spread: Callable[[], Spread]

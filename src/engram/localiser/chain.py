@@ -5,8 +5,8 @@ since a robot was lost, or was told its place, are on trial. They settle once on
 itself, or once they have agreed along some way. A match that contradicts them before that withdraws
 them. If it comes later, the robot was rather carried elsewhere.
 
-A drive that joins nothing for long meets many places that look alike, some of them over tens of
-metres. What joins it has to agree along more way, however sure one fix is.
+The longer a drive hangs on nothing, the more places it meets that look alike, some of them over
+tens of metres. What joins it has to agree along as much way, however sure one fix is.
 """
 
 from __future__ import annotations
@@ -32,14 +32,10 @@ class FixChain:
     Args:
         sure_confidence: log-odds of one fix by itself that settle the chain.
         settle_after_m: distance between agreeing fixes that settles it, metres.
-        join_after_m: the same of a chain that joins two parts of a map; no single fix settles it.
     """
 
-    def __init__(
-        self, sure_confidence: float, settle_after_m: float, join_after_m: float = 0.0
-    ) -> None:
+    def __init__(self, sure_confidence: float, settle_after_m: float) -> None:
         self._limits = sure_confidence, settle_after_m
-        self._to_join = np.inf, max(join_after_m, settle_after_m)
         self._sure, self._after_m = self._limits
         self._on_trial: deque[int] = deque(maxlen=MOST_ON_TRIAL)
         self._moved_m = 0.0
@@ -51,7 +47,7 @@ class FixChain:
         return bool(self._on_trial)
 
     def begin(
-        self, stamp_ns: int, found: Position, alone: float, *, joins: bool = False
+        self, stamp_ns: int, found: Position, alone: float, joins_after_m: float = 0.0
     ) -> tuple[int, ...]:
         """A fix that agrees with none before it; returns the stamps of those on trial.
 
@@ -59,9 +55,12 @@ class FixChain:
             stamp_ns: stamp of its frame.
             found: where it is.
             alone: its confidence without the fixes before it.
-            joins: whether it joins two parts of a map.
+            joins_after_m: distance between agreeing fixes, metres, that joins two parts of a map.
+                Where it is longer than what settles any chain, no single fix settles this one.
         """
-        self._sure, self._after_m = self._to_join if joins else self._limits
+        self._sure, self._after_m = self._limits
+        if joins_after_m > self._after_m:
+            self._sure, self._after_m = np.inf, joins_after_m
         before = tuple(self._on_trial)
         self._on_trial.clear()
         self._on_trial.append(stamp_ns)

@@ -3,7 +3,8 @@
 Such a match is too weak, or contradicts the estimated position. It may be correct, or two cars
 parked alike in two streets. Correct matches agree with each other while the robot drives on: the
 position of the first, carried on by odometry, predicts that of the second. So the match waits,
-later frames attempt the nodes near it, and the next match that agrees with it is accepted.
+later frames attempt the nodes near it, and the next match that agrees with it is accepted. Of a
+robot that found nothing for long, matches must agree one after another over a longer way.
 """
 
 from __future__ import annotations
@@ -25,8 +26,23 @@ from engram.localiser.settings import HypothesesConfig
 
 @dataclass(slots=True)
 class _Hypothesis:
+    """A match that waits.
+
+    Attributes:
+        position: where it says the robot is now.
+        driven_m: way since the match.
+        agreed_m: way before it along which others agreed with it.
+    """
+
     position: Position
     driven_m: float = 0.0
+    agreed_m: float = 0.0
+
+    def renew(self, position: Position) -> None:
+        """Goes on from a later match that agrees."""
+        self.position = position
+        self.agreed_m += self.driven_m
+        self.driven_m = 0.0
 
 
 class Hypotheses:
@@ -103,18 +119,25 @@ class Hypotheses:
         confirmed = []
         for outcome in found:
             agreeing = [one for one, near in expected if self._agree(outcome, near)]
-            if any(one.driven_m >= self._config.base_line_m for one in agreeing):
+            if any(one.agreed_m + one.driven_m >= self._needed_m(outcome) for one in agreeing):
                 confirmed.append(outcome)
             elif not agreeing:
                 new = _Hypothesis(_position_of(outcome))
                 expected.append((new, self._predictions(new.position)))
                 self._waiting = [*self._waiting, new][-self._config.most :]
+            for one in agreeing:
+                if one.driven_m >= self._config.base_line_m:
+                    one.renew(_position_of(outcome))
         return [
             replace(outcome, accepted=True, confidence=outcome.confidence + witness)
             if outcome in confirmed
             else outcome
             for outcome in outcomes
         ]
+
+    def _needed_m(self, outcome: Outcome) -> float:
+        config = self._config
+        return config.long_base_line_m if outcome.candidate.lost_long else config.base_line_m
 
     def _predictions(self, position: Position) -> dict[int, Prediction]:
         near = self._search(position)

@@ -53,9 +53,9 @@ class Keeper:
         del certain
         return True
 
-    def joins_parts(self) -> bool:
-        """Whether a fix elsewhere in the map would join what the drive saved for long to it."""
-        return False
+    def alone_m(self) -> float:
+        """Way that what the drive saved has hung on nothing, metres; 0 if it hangs on the map."""
+        return 0.0
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:
         """Keeps the result for a frame; returns it, completed by what was stored."""

@@ -295,17 +295,17 @@ class Localiser:
             outcomes = self._judged(live, outcomes)
             clock.lap("attempts")
             self._tried.add(live, self._driven_m, self._near, outcomes)
-        success = self._conclude(live, outcomes, joins=keeper.joins_parts())
+        success = self._conclude(live, outcomes, keeper.alone_m())
         clock.lap("remember")
         return self._result(live, success, clock.stage_ms)
 
-    def _conclude(self, live: Frame, outcomes: list[Outcome], *, joins: bool) -> Outcome | None:
+    def _conclude(self, live: Frame, outcomes: list[Outcome], alone_m: float) -> Outcome | None:
         """Sets the position to that of the best match; without one, reports the failures."""
         self._outcomes = outcomes
         self._reference = None if self.position is None else self.position.node
         success = best_success(outcomes, self.config.acceptance.rule)
         if success is not None:
-            self._settle(live, success, joins=joins)
+            self._settle(live, success, alone_m)
             return success
         if any(one.candidate.row is not None for one in outcomes):
             self._prover.missed()
@@ -530,14 +530,14 @@ class Localiser:
         self._damaged.update(candidate.index for candidate in damaged)
         return [outcome for outcome in outcomes if not outcome.damaged]
 
-    def _settle(self, live: Frame, success: Outcome, *, joins: bool) -> None:
+    def _settle(self, live: Frame, success: Outcome, alone_m: float) -> None:
         """Sets the position to (n, ``T_n_q``) and the open loop to 0 (method §3.3)."""
         node_from_live, covariance = success.match.reference_from_live, success.match.covariance
         assert node_from_live is not None
         assert covariance is not None
         found = Position(success.candidate.node, node_from_live, covariance)
         certain = self.certain
-        self._prover.prove(live, success, found, self.position, certain=certain, joins=joins)
+        self._prover.prove(live, success, found, self.position, alone_m, certain=certain)
         self.position = found
         self._open_loop_m = 0.0
         self._guessed_m2 = 0.0

@@ -35,9 +35,7 @@ class Prover:
         self._graph = graph
         self._accepted = accepted
         self._record = Record()
-        self._chain = FixChain(
-            accepted.sure_confidence, accepted.settle_after_m, accepted.join_after_m
-        )
+        self._chain = FixChain(accepted.sure_confidence, accepted.settle_after_m)
         self.standing = Standing()
         self._told = False
         self.told_otherwise = False
@@ -91,9 +89,9 @@ class Prover:
         success: Outcome,
         found: Position,
         before: Position | None,
+        alone_m: float = 0.0,
         *,
         certain: bool,
-        joins: bool,
     ) -> None:
         """Checks a fix against those before it; the weaker of two that contradict goes.
 
@@ -102,8 +100,9 @@ class Prover:
             success: the accepted match.
             found: the position by it.
             before: the position before it; None if unknown.
+            alone_m: way that what the drive saved has hung on nothing, metres: a fix that nothing
+                predicts joins it to the map.
             certain: whether odometry since the last match had only short gaps.
-            joins: whether a fix that nothing predicts joins two parts of the map.
         """
         evidence = success.evidence
         assert evidence is not None
@@ -111,9 +110,10 @@ class Prover:
         before = self._chain.position or before
         fits = True if predicted else self._agrees(found, before if certain else None)
         alone = confidence_of(live.descriptor).alone(evidence)
-        joins = joins and fits is not True
+        joins_after_m = 0.0 if fits else min(alone_m, self._accepted.join_after_m)
+        joins = joins_after_m > self._accepted.settle_after_m
         if fits is False or joins or not self.standing.agreed:
-            withdraws = self._chain.begin(live.stamp_ns, found, alone, joins=joins)
+            withdraws = self._chain.begin(live.stamp_ns, found, alone, joins_after_m)
             self.withdraws = withdraws if fits is False else ()
         else:
             self._chain.join(live.stamp_ns, found, alone)

@@ -45,7 +45,7 @@ class Success(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class HypothesesConfig:
-    """How long weak matches of a lost robot wait for a second one."""
+    """How long weak matches of a lost robot wait for others that agree."""
 
     base_line_m: Annotated[
         float,
@@ -55,6 +55,14 @@ class HypothesesConfig:
             "explains both",
         ),
     ] = 4.0
+    long_base_line_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="the same, by matches that agree on the way, once a robot has found "
+            "nothing for `acceptance.lost_long_m`: streets look alike over tens of metres",
+        ),
+    ] = 30.0
     forgotten_after_m: Annotated[
         float,
         Meta(
@@ -91,7 +99,8 @@ class LocaliserConfig:
         guide_below_m, guide_below_rad: the prediction guides an attempt if its standard deviations
             are below both; 0 turns guidance off. Source: `lab/reports/constants.md`.
         narrow_m, narrow_rad: standard deviations of a second search near the prediction, where the
-            first ends with few inliers or far from it. Source: `lab/reports/trust.md`.
+            first ends with few inliers or far from it; 0 m: there is none. Source:
+            `lab/reports/trust.md`.
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
             They keep 98.7 % of the matches it would accept. Source: `lab/reports/constants.md`.
         neighbourhood, path_entries, success, lens_depth_m, fix_sigmas: see their descriptions.

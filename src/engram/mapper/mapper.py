@@ -43,8 +43,6 @@ class MapperConfig:
         sure_inliers: a frame that matched with fewer inliers is saved all the same: the place has
             come to look different, and frames that match this one need not match its old nodes. 0
             saves none of them, as published. Source: lab/reports/constants.md.
-        alone_m: a drive that has hung on nothing for this long joins the map only where fixes agree
-            along `localiser.acceptance.join_after_m`, metres.
         tie_within_m: a new experience is also tied to the session's last saved node within this
             distance, metres. Source: the search radius, method §3.
         checkpoint_every: live frames between two checkpoints of the map.
@@ -57,7 +55,6 @@ class MapperConfig:
     save_every_m: float = 1.0
     save_every_rad: float = float(np.deg2rad(15.0))
     sure_inliers: int = 60
-    alone_m: float = 100.0
     tie_within_m: float = 8.0
     checkpoint_every: int = 20
     memory_bytes: int = 256_000_000
@@ -65,7 +62,7 @@ class MapperConfig:
     proximity: ProximityConfig = field(default_factory=ProximityConfig)
 
     def __post_init__(self) -> None:
-        for name in ("save_every_m", "save_every_rad", "alone_m", "tie_within_m"):
+        for name in ("save_every_m", "save_every_rad", "tie_within_m"):
             value = getattr(self, name)
             if not 0 <= value < np.inf:
                 raise ConfigError(f"mapper: {name} is {value}, must be finite and >= 0")
@@ -146,10 +143,9 @@ class Mapper(Memory):
         """See `Keeper`."""
         return not certain or self._loops is None
 
-    def joins_parts(self) -> bool:
+    def alone_m(self) -> float:
         """See `Keeper`."""
-        alone_m = self._localiser.driven_m - self._alone_from_m
-        return not self._joined and alone_m > self.config.alone_m
+        return 0.0 if self._joined else self._localiser.driven_m - self._alone_from_m
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:
         """Saves a frame that did not match, or weakly; ties experiences to their neighbours.
