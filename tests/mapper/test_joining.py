@@ -1,4 +1,4 @@
-"""A drive that has hung on nothing joins a map only where fixes agree along as much way."""
+"""A drive that has hung on nothing joins a map only where fixes agree for long enough."""
 
 from __future__ import annotations
 
@@ -51,11 +51,12 @@ def parts_after(path: Path, *parts: list[Seen]) -> int:
     [
         (120.0, 40.0, 2),  # alike for a while: nothing is joined
         (120.0, 86.0, 1),  # the street itself
-        (60.0, 40.0, 2),
-        (20.0, 40.0, 1),  # a drive that has just begun joins along as much way as it was alone
+        (110.0, 30.0, 2),
+        (60.0, 40.0, 1),  # a third of the way that it was alone
+        (20.0, 40.0, 1),
     ],
 )
-def test_a_drive_that_hung_on_nothing_joins_where_fixes_agree_along_as_much_way(
+def test_a_drive_that_hung_on_nothing_joins_where_fixes_agree_along_a_share_of_it(
     tmp_path: Path, alone_m: float, alike_m: float, parts: int
 ) -> None:
     path = tmp_path / "street.engram"

@@ -45,9 +45,10 @@ class AcceptanceConfig:
             good.
         settle_after_m: distance along which weaker fixes must agree to be believed for good,
             metres. Until then a contradicting one withdraws them, and no edge rests on them.
-        join_after_m: where they would join a drive to the rest of a map, they must agree along as
-            much way as it has hung on nothing, however sure they are, but no more than this,
-            metres: streets look alike over tens of metres.
+        join_share, join_after_m: where they would join a drive to the rest of a map, they must
+            agree along this share of the way that it has hung on nothing, however sure they are,
+            but no more than so many metres: the longer the way, the more streets it has met that
+            look alike, some of them over tens of metres.
         doubt_after: fixes that should have come since the last one, and did not, after which a
             robot looks for itself all over the map; so does one that was told its place, until its
             first fix. 0: neither does, before it is lost.
@@ -78,6 +79,7 @@ class AcceptanceConfig:
     lost_long_m: float = 100.0
     sure_confidence: float = 7.01
     settle_after_m: float = 10.0
+    join_share: float = 1 / 3
     join_after_m: float = 60.0
     doubt_after: float = 3.0
     rival_share: float = 0.6

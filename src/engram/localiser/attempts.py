@@ -221,25 +221,29 @@ class Attempter:
 
         Of few landmarks that are right, a wide search may miss the pose that most of them agree on:
         in rain it ends a metre off with 20 to 35 inliers, where a narrow one finds as many at the
-        right place. So where fixes confirm the prediction, what is weak or far from it is sought
-        once more. The published rule makes one search.
+        right place. So where fixes confirm the position, what is weak or far from its prediction is
+        sought once more. What both find of a weak match must be one place: odometry may be wrong,
+        and much looks alike near where it puts the robot. The published rule makes one search.
         """
         prediction, acceptance = candidate.prediction, self._acceptance
+        once = acceptance.rule is Rule.INLIERS or not self._narrow[0]
+        if once or prediction is None or not candidate.standing.agreed:
+            return match
         if match is None or match.reference_from_live is None or match.inliers < _LEAST_WEIGHED:
             return match
-        confirmed = candidate.guided and candidate.standing.agreed > 0
-        once = acceptance.rule is Rule.INLIERS or not self._narrow[0]
-        if prediction is None or not confirmed or once:
-            return match
+        far_m = _apart_m(match.reference_from_live, prediction.node_from_live)
         weak = match.inliers < acceptance.min_inliers
-        far_m = _apart_m(match, prediction)
         if not weak and far_m <= acceptance.slack_m:
             return match
         narrow = Prediction(prediction.node_from_live, *self._narrow)
-        closer = self._matched(live, live_id, replace(candidate, prediction=narrow))
-        if closer is None or closer.inliers < match.inliers:
+        closer = self._matched(live, live_id, replace(candidate, prediction=narrow, guided=True))
+        if closer is None or closer.reference_from_live is None or closer.inliers < match.inliers:
             return match
-        return closer if weak or _apart_m(closer, prediction) < far_m else match
+        if weak:
+            moved_m = _apart_m(closer.reference_from_live, match.reference_from_live)
+            return closer if moved_m <= acceptance.slack_m else match
+        its_m = _apart_m(closer.reference_from_live, prediction.node_from_live)
+        return closer if its_m < far_m else match
 
     def _matched(self, live: Frame, live_id: NodeId, candidate: Candidate) -> Match | None:
         """One more match; None if the node is damaged."""
@@ -364,9 +368,8 @@ def _expected(guide: Prediction | None) -> tuple[SE3 | None, NDArray[np.float64]
     return guide.node_from_live, covariance
 
 
-def _apart_m(match: Match, prediction: Prediction) -> float:
-    assert match.reference_from_live is not None
-    return (prediction.node_from_live.inverse() @ match.reference_from_live).distance_m
+def _apart_m(a: SE3, b: SE3) -> float:
+    return (a.inverse() @ b).distance_m
 
 
 def up_to_first_success(outcomes: Sequence[Outcome]) -> list[Outcome]:

@@ -6,7 +6,7 @@ itself, or once they have agreed along some way. A match that contradicts them b
 them. If it comes later, the robot was rather carried elsewhere.
 
 The longer a drive hangs on nothing, the more places it meets that look alike, some of them over
-tens of metres. What joins it has to agree along as much way, however sure one fix is.
+tens of metres. What joins it has to agree along a share of that way, however sure one fix is.
 """
 
 from __future__ import annotations

@@ -110,10 +110,13 @@ class Prover:
         before = self._chain.position or before
         fits = True if predicted else self._agrees(found, before if certain else None)
         alone = confidence_of(live.descriptor).alone(evidence)
-        joins_after_m = 0.0 if fits else min(alone_m, self._accepted.join_after_m)
-        joins = joins_after_m > self._accepted.settle_after_m
+        accepted = self._accepted
+        joins_after_m = min(accepted.join_share * alone_m, accepted.join_after_m)
+        joins = not fits and joins_after_m > accepted.settle_after_m
         if fits is False or joins or not self.standing.agreed:
-            withdraws = self._chain.begin(live.stamp_ns, found, alone, joins_after_m)
+            withdraws = self._chain.begin(
+                live.stamp_ns, found, alone, joins_after_m if joins else 0
+            )
             self.withdraws = withdraws if fits is False else ()
         else:
             self._chain.join(live.stamp_ns, found, alone)
