@@ -369,7 +369,7 @@ def _expected(guide: Prediction | None) -> tuple[SE3 | None, NDArray[np.float64]
 
 
 def _apart_m(a: SE3, b: SE3) -> float:
-    return (a.inverse() @ b).distance_m
+    return float(np.linalg.norm(a.translation - b.translation))
 
 
 def up_to_first_success(outcomes: Sequence[Outcome]) -> list[Outcome]:
