@@ -38,9 +38,10 @@ class AcceptanceConfig:
         min_confidence_told: the same where no fix has confirmed the position yet: it may have been
             told wrong, and streets look alike.
         min_confidence_lost: the same of a match that nothing predicts: many such are tried.
-        lost_long_m: distance without a match beyond which a lost robot believes only a match of
-            `sure_confidence`, metres: the further it drives, the more places that look alike it
-            has tried, and the less likely it is that the map shows the road at all.
+        lost_long_m: distance without a match, metres, beyond which a lost robot believes one match
+            only if it is of `sure_confidence`, and others if they agree along
+            `hypotheses.long_base_line_m`: the further it drives, the more places that look alike
+            it has tried, and the less likely it is that the map shows the road at all.
         sure_confidence: log-odds of one fix, without those before it, from which it is believed for
             good.
         settle_after_m: distance along which weaker fixes must agree to be believed for good,

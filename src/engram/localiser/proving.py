@@ -111,12 +111,10 @@ class Prover:
         fits = True if predicted else self._agrees(found, before if certain else None)
         alone = confidence_of(live.descriptor).alone(evidence)
         accepted = self._accepted
-        joins_after_m = min(accepted.join_share * alone_m, accepted.join_after_m)
-        joins = not fits and joins_after_m > accepted.settle_after_m
+        joins_after_m = 0.0 if fits else min(accepted.join_share * alone_m, accepted.join_after_m)
+        joins = joins_after_m > accepted.settle_after_m
         if fits is False or joins or not self.standing.agreed:
-            withdraws = self._chain.begin(
-                live.stamp_ns, found, alone, joins_after_m if joins else 0
-            )
+            withdraws = self._chain.begin(live.stamp_ns, found, alone, joins_after_m)
             self.withdraws = withdraws if fits is False else ()
         else:
             self._chain.join(live.stamp_ns, found, alone)
