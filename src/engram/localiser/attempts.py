@@ -39,6 +39,7 @@ from engram.localiser.confidence import (
     Standing,
     confidence_of,
 )
+from engram.localiser.localisation import Position
 from engram.localiser.settings import LocaliserConfig
 from engram.localiser.spread import Spread, inlier_spread
 
@@ -95,6 +96,14 @@ class Outcome:
     damaged: bool = False
     confidence: float = -math.inf
     evidence: Evidence | None = None
+
+    @property
+    def position(self) -> Position:
+        """Where the robot is by this match, which must have a pose."""
+        pose, covariance = self.match.reference_from_live, self.match.covariance
+        assert pose is not None
+        assert covariance is not None
+        return Position(self.candidate.node, pose, covariance)
 
 
 class Matcher(Protocol):

@@ -122,12 +122,12 @@ class Hypotheses:
             if any(one.agreed_m + one.driven_m >= self._needed_m(outcome) for one in agreeing):
                 confirmed.append(outcome)
             elif not agreeing:
-                new = _Hypothesis(_position_of(outcome))
+                new = _Hypothesis(outcome.position)
                 expected.append((new, self._predictions(new.position)))
                 self._waiting = [*self._waiting, new][-self._config.most :]
             for one in agreeing:
                 if one.driven_m >= self._config.base_line_m:
-                    one.renew(_position_of(outcome))
+                    one.renew(outcome.position)
         return [
             replace(outcome, accepted=True, confidence=outcome.confidence + witness)
             if outcome in confirmed
@@ -148,10 +148,3 @@ class Hypotheses:
         pose = outcome.match.reference_from_live
         assert pose is not None
         return prediction is not None and agrees(pose, prediction, self._acceptance)
-
-
-def _position_of(outcome: Outcome) -> Position:
-    pose, covariance = outcome.match.reference_from_live, outcome.match.covariance
-    assert pose is not None
-    assert covariance is not None
-    return Position(outcome.candidate.node, pose, covariance)

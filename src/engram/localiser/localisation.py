@@ -127,7 +127,8 @@ class Localisation:
         status: whether the frame was matched, and if not, what is known.
         node: the matched node; None unless `LOCALISED`.
         node_stamp_ns: stamp of that node.
-        node_from_live: measured pose of the live camera in it; None unless `LOCALISED`.
+        node_from_live: pose of the live camera in it, by the match and, if that is weak, by those
+            before it that led to expect it; None unless `LOCALISED`.
         covariance: (6, 6) float64 of `node_from_live`, left perturbation, [translation, rotation].
         inliers: landmarks that agree with the pose, 0 unless `LOCALISED`.
         confidence: log-odds that the match is right; of the best attempt if none was accepted,
@@ -138,8 +139,9 @@ class Localisation:
         candidates: nodes in reach that could have been attempted.
         open_loop_m: distance driven on odometry alone since the last match, metres.
         motion: motion since the previous usable frame, as far as it is known.
-        position: the best estimate, measured or carried on by odometry; None while `LOST` with
+        position: the best estimate, as above or carried on by odometry; None while `LOST` with
             no estimate.
+        measured: the same by the last match alone, on which edges of a map rest.
         looked_up: whether place recognition ran for this frame.
         damaged: candidates whose landmarks cannot be read, each reported once; the localiser skips
             them from then on. ``engram check`` gives details.
@@ -165,6 +167,7 @@ class Localisation:
     inliers: int = 0
     confidence: float = -math.inf
     position: Position | None = None
+    measured: Position | None = None
     looked_up: bool = False
     damaged: tuple[NodeId, ...] = ()
     withdraws: tuple[int, ...] = ()

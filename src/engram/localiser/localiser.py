@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.frontend import Frame, FrameStatus
-from engram.frontend.matching import NO_MATCH
 from engram.graph.breadth_first import breadth_first
 from engram.graph.clock import day_of, hour_of_day
 from engram.graph.graph import ExperienceGraph
@@ -30,6 +29,7 @@ from engram.localiser.attempts import (
 )
 from engram.localiser.choice import best_success, uncontested
 from engram.localiser.confidence import confidence_of
+from engram.localiser.fusing import Track
 from engram.localiser.given import LiveDrive, MapParts
 from engram.localiser.hypotheses import Hypotheses
 from engram.localiser.keeper import KEEPS_NOTHING, Keeper
@@ -115,7 +115,9 @@ class Localiser:
         )
         self._lenses = self._lenses_of_map()
         self._tried = Tried(self.config.recent, drive.basin, self._lenses)
-        self.position: Position | None = None
+        # The published rule knows no more than the last match.
+        once = self.config.acceptance.rule is Rule.INLIERS
+        self._track = Track(known.graph, 0.0 if once else self.config.earlier_doubt)
         self._open_loop_m = 0.0
         self._driven_m = 0.0
         self._motion = UNMOVED
@@ -134,6 +136,16 @@ class Localiser:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    @property
+    def position(self) -> Position | None:
+        """Where the robot is by its last match or saved node; None if unknown."""
+        return self._track.measured
+
+    @property
+    def best_position(self) -> Position | None:
+        """Where it is by the matches before that, too."""
+        return self._track.best
 
     @property
     def graph(self) -> ExperienceGraph:
@@ -196,7 +208,7 @@ class Localiser:
             said: whether somebody says so, who may be wrong where the robot knew its place.
         """
         self._prover.forget(agreed, told_otherwise=said and self.certain)
-        self.position = position
+        self._track.set(position)
         if open_loop_m is not None:
             self._open_loop_m = open_loop_m
         self._guessed_m2 = guessed_m**2
@@ -216,7 +228,7 @@ class Localiser:
 
     def lose(self) -> None:
         """Discards the position: the robot was restarted or carried elsewhere."""
-        self.position = None
+        self._track.set(None)
         self._prover.forget()
         self._hypotheses.forget()
         if self._relocaliser is not None:
@@ -249,7 +261,7 @@ class Localiser:
 
     def settle_in(self, node: NodeId) -> None:
         """Sets the position to `node`, as which the live frame was just saved (method §4)."""
-        self.position = Position.at(node)
+        self._track.set(Position.at(node))
         self._prover.settled()
         self._guessed_m2 = 0.0
 
@@ -341,8 +353,7 @@ class Localiser:
         if self._relocaliser is not None:
             followed = not motion.jumped and motion.guessed_m <= self.config.followed_gap_m
             self._relocaliser.carry_on(motion.prev_from_curr if followed else None)
-        if self.position is not None:
-            self.position = self.position.carried_on(motion.prev_from_curr, motion.covariance)
+        self._track.carry_on(motion.prev_from_curr, motion.covariance)
         self._prover.carry_on(motion.prev_from_curr, motion.covariance)
 
     @property
@@ -532,13 +543,9 @@ class Localiser:
 
     def _settle(self, live: Frame, success: Outcome, alone_m: float) -> None:
         """Sets the position to (n, ``T_n_q``) and the open loop to 0 (method §3.3)."""
-        node_from_live, covariance = success.match.reference_from_live, success.match.covariance
-        assert node_from_live is not None
-        assert covariance is not None
-        found = Position(success.candidate.node, node_from_live, covariance)
-        certain = self.certain
-        self._prover.prove(live, success, found, self.position, alone_m, certain=certain)
-        self.position = found
+        found, before, certain = success.position, self.position, self.certain
+        leans = self._prover.prove(live, success, found, before, alone_m, certain=certain)
+        self._track.fix(found, leans=leans)
         self._open_loop_m = 0.0
         self._guessed_m2 = 0.0
         self._hypotheses.forget()
@@ -562,7 +569,7 @@ class Localiser:
         stage_ms: dict[str, float],
     ) -> Localisation:
         node = None if success is None else self._graph.node(success.candidate.index)
-        match = NO_MATCH if success is None else success.match
+        best = None if success is None else self.best_position
         return Localisation(
             stamp_ns=live.stamp_ns,
             status=self._status_without_match() if node is None else LocalisationStatus.LOCALISED,
@@ -571,27 +578,21 @@ class Localiser:
             candidates=0 if self._near is None else len(self._near),
             motion=self._motion,
             open_loop_m=self._open_loop_m,
-            position=self._position_now(),
+            position=self._track.best_after(self._motion.ahead),
             looked_up=self._looked_up,
             damaged=self._new_damaged,
             withdraws=self._prover.withdraws,
             node=None if node is None else node.id,
             node_stamp_ns=None if node is None else node.stamp_ns,
-            node_from_live=match.reference_from_live,
-            covariance=match.covariance,
-            inliers=match.inliers,
+            node_from_live=None if best is None else best.node_from_live,
+            covariance=None if best is None else best.covariance,
+            measured=self.position,
+            inliers=0 if success is None else success.match.inliers,
             confidence=max((one.confidence for one in self._outcomes), default=-math.inf)
             if success is None
             else success.confidence,
             stage_ms=stage_ms,
         )
-
-    def _position_now(self) -> Position | None:
-        """The position; at an unusable frame carried on by a guess, whose uncertainty grows."""
-        ahead = self._motion.ahead
-        if self.position is None or ahead is None:
-            return self.position
-        return self.position.carried_on(*ahead)
 
     def _status_without_match(self) -> LocalisationStatus:
         if self._motion.odometry.status not in {OdometryStatus.OK, OdometryStatus.FIRST}:

@@ -14,6 +14,7 @@ from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
 from engram.localiser.attempts import Outcome
 from engram.localiser.chain import FixChain
 from engram.localiser.confidence import Record, Standing, confidence_of
+from engram.localiser.fusing import seen_from
 from engram.localiser.localisation import Position
 
 
@@ -92,8 +93,10 @@ class Prover:
         alone_m: float = 0.0,
         *,
         certain: bool,
-    ) -> None:
+    ) -> bool:
         """Checks a fix against those before it; the weaker of two that contradict goes.
+
+        Returns whether it is weak, and a position that fixes had confirmed predicted it.
 
         Args:
             live: the live frame.
@@ -107,6 +110,8 @@ class Prover:
         evidence = success.evidence
         assert evidence is not None
         predicted = math.isfinite(evidence.apart)
+        weak = success.match.inliers < confidence_of(live.descriptor).weak_inliers
+        leans = weak and certain and predicted and self.standing.agreed > 0
         before = self._chain.position or before
         fits = True if predicted else self._agrees(found, before if certain else None)
         alone = confidence_of(live.descriptor).alone(evidence)
@@ -120,16 +125,15 @@ class Prover:
             self._chain.join(live.stamp_ns, found, alone)
         self._told = self.told_otherwise = False
         self._record.fixed(success.match.inliers, agrees=fits is True)
+        return leans
 
     def _agrees(self, found: Position, before: Position | None) -> bool | None:
         """Whether a match that nothing predicted agrees with a position; None if unknown."""
         if before is None:
             return None
-        a, b = self._graph.index(before.node), self._graph.index(found.node)
-        known = self._graph.predict(b, a)
-        if known is None:
+        there = seen_from(self._graph, found.node, before)
+        if there is None:
             return None
-        there = Position(found.node, *known).carried_on(before.node_from_live, before.covariance)
         sigma_rad = float(np.sqrt(there.covariance[4, 4]))
         prediction = Prediction(there.node_from_live, there.sigma_m, sigma_rad)
         return agrees(found.node_from_live, prediction, self._accepted)

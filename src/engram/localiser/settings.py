@@ -19,7 +19,7 @@ from engram.ranking.lessons import LessonsConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 19
+METHOD_VERSION = 20
 
 
 class NeighbourhoodSearch(StrEnum):
@@ -103,7 +103,8 @@ class LocaliserConfig:
             `lab/reports/trust.md`.
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
             They keep 98.7 % of the matches it would accept. Source: `lab/reports/constants.md`.
-        neighbourhood, path_entries, success, lens_depth_m, fix_sigmas: see their descriptions.
+        neighbourhood, path_entries, success, lens_depth_m, fix_sigmas, earlier_doubt: see their
+            descriptions.
         recent: how the ranking weights this session's recent attempts.
         hypotheses: how weak matches of a lost robot are confirmed.
         basin, lessons: what the map's attempts say of distance, and of each node.
@@ -121,6 +122,15 @@ class LocaliserConfig:
     guide_below_rad: float = float(np.deg2rad(4.0))
     narrow_m: float = 0.1
     narrow_rad: float = 0.01
+    earlier_doubt: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="where a match is weak, a robot is told the mean of it and of what earlier "
+            "ones led to expect, whose covariance counts so many times, as their errors are not "
+            "independent; 0: the match alone",
+        ),
+    ] = 2.0
     lost_max_samples: int = 256
     lost_max_hypotheses: int = 100
     neighbourhood: Annotated[

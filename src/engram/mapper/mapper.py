@@ -162,7 +162,7 @@ class Mapper(Memory):
             edges += self._join(found)
         if self._looks_new(found) and self._worth_saving(live, found.motion):
             save = self._save_matched if found.localised else self._save
-            saved, laid = save(live, found.position)
+            saved, laid = save(live, found.measured)
             edges += laid
             visit = saved.id, PathEntryKind.SAVED
         self._put(live, Records(node=saved, frame=live if saved else None, edges=edges), visit)
@@ -203,8 +203,8 @@ class Mapper(Memory):
         )
         if self._localiser.on_trial:
             if not self._waiting and self._experience and self._since_saved is not None:
-                assert found.position is not None
-                matched.append(edge_through_live(self._since_saved, found.position, EdgeKind.TIE))
+                assert found.measured is not None
+                matched.append(edge_through_live(self._since_saved, found.measured, EdgeKind.TIE))
             self._wait_with(matched)
             return []
         self.votes.count(found.stamp_ns, self._localiser.outcomes)
@@ -351,8 +351,8 @@ class Mapper(Memory):
         experience, self._experience = self._experience, []
         if not experience or self._since_saved is None:
             return []
-        assert localisation.position is not None
-        tie = edge_through_live(self._since_saved, localisation.position, EdgeKind.TIE)
+        assert localisation.measured is not None
+        tie = edge_through_live(self._since_saved, localisation.measured, EdgeKind.TIE)
         self._graph.add_edge(tie)
         return [tie, *self._tightened(experience)]
 

@@ -389,7 +389,7 @@ class Robot:
             candidates=0,
             open_loop_m=0.0,
             motion=Motion(OdometryStep(OdometryStatus.UNUSABLE_FRAME)),
-            position=self._localiser.position,
+            position=self._localiser.best_position,
         )
 
 

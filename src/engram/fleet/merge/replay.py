@@ -129,7 +129,7 @@ class Replay(Keeper):
         if self._options.seed is SeedFrom.PLACES:
             return None
         if self._ahead is not None and self._ahead.found.stamp_ns == live.stamp_ns:
-            return Hint(self._ahead.found.position, found=self._ahead.found)
+            return Hint(self._ahead.found.measured, found=self._ahead.found)
         if self._run:
             known = self._known_neighbour(node.id, _MEASURED, self._run[0])
         if known is None:
@@ -302,7 +302,8 @@ class Replay(Keeper):
             reason = self._reason(one.live, found)
             if reason is None:
                 # The fleet map covers this place already.
-                self._merge.omit(node.id, _measured(found), one.stored.landmark_hash)
+                assert found.measured is not None
+                self._merge.omit(node.id, found.measured, one.stored.landmark_hash)
                 self._link(node.id)
             else:
                 self._take(one)
@@ -326,7 +327,7 @@ class Replay(Keeper):
     def _reason(self, frame: Frame, found: Localisation) -> Reason | None:
         """Why a node is taken; None if its match can replace it for all drives that use it."""
         if self._omits is not None:
-            omitted = self._omits and found.position is not None
+            omitted = self._omits and found.measured is not None
             return None if omitted else Reason.WHOLE_SEGMENT
         if found.localised:
             is_sure = found.inliers >= self._options.sure_inliers
@@ -345,7 +346,8 @@ class Replay(Keeper):
         self._run.append(index)
         self._link(node.id)
         if found.localised:
-            at = _measured(found)
+            at = found.measured
+            assert at is not None
             match = Edge(at.node, node.id, EdgeKind.MATCH, at.node_from_live, at.covariance)
             self._merge.add_edge(match)
         else:
@@ -377,13 +379,3 @@ class Replay(Keeper):
         if run:
             proximity = self._settings.mapper.proximity
             self._merge.write_edges(tighten_chain(self._merge.graph, run, proximity))
-
-
-def _measured(found: Localisation) -> Position:
-    """Position of a localised frame; of others in a segment that is omitted, by odometry."""
-    if found.node is None:
-        assert found.position is not None
-        return found.position
-    assert found.node_from_live is not None
-    assert found.covariance is not None
-    return Position(found.node, found.node_from_live, found.covariance)
