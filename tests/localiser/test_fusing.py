@@ -17,7 +17,7 @@ from engram.graph.model import NodeId
 from engram.localiser import Position
 from engram.localiser.acceptance import Rule
 from engram.localiser.confidence import CONFIDENCES
-from engram.localiser.fusing import Track, fused, seen_from
+from engram.localiser.fusing import Track, fused
 from engram.maps import Map
 from engram.robot import Front, Robot, Settings
 from engram.robot.localisers import localiser_in
@@ -98,20 +98,17 @@ def test_what_contradicts_or_is_not_joined_or_not_asked_for_counts_alone() -> No
         track.fix(at(1.0), leans=True)
         track.fix(alone, leans=leans)
         assert track.best is alone
-    track = Track(GRAPH, 2.0)
+    apart = type(GRAPH)()
+    for node in (GRAPH.node(9), GRAPH.node(10)):
+        apart.add_node(node)
+    track = Track(apart, 2.0)
+    track.fix(at(1.0, node=GRAPH.node(9).id), leans=True)
     track.fix(alone, leans=True)
     assert track.best is alone
     track.set(None)
     track.carry_on(ahead(1.0), SURE)
     assert track.measured is None
     assert track.best is None
-
-
-def test_a_node_that_nothing_joins_is_not_seen() -> None:
-    graph = type(GRAPH)()
-    for node in GRAPH.nodes[:2]:
-        graph.add_node(node)
-    assert seen_from(graph, graph.node(1).id, at(1.0, node=graph.node(0).id)) is None
 
 
 def test_the_mean_is_nearer_to_the_truth_where_errors_are_as_claimed() -> None:

@@ -543,9 +543,9 @@ class Localiser:
 
     def _settle(self, live: Frame, success: Outcome, alone_m: float) -> None:
         """Sets the position to (n, ``T_n_q``) and the open loop to 0 (method §3.3)."""
-        found, before, certain = success.position, self.position, self.certain
-        leans = self._prover.prove(live, success, found, before, alone_m, certain=certain)
-        self._track.fix(found, leans=leans)
+        self._prover.prove(live, success, self.position, alone_m, certain=self.certain)
+        leans = self._prover.leans(live, success, certain=self.certain)
+        self._track.fix(success.position, leans=leans)
         self._open_loop_m = 0.0
         self._guessed_m2 = 0.0
         self._hypotheses.forget()

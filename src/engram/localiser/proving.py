@@ -88,30 +88,24 @@ class Prover:
         self,
         live: Frame,
         success: Outcome,
-        found: Position,
         before: Position | None,
         alone_m: float = 0.0,
         *,
         certain: bool,
-    ) -> bool:
+    ) -> None:
         """Checks a fix against those before it; the weaker of two that contradict goes.
-
-        Returns whether it is weak, and a position that fixes had confirmed predicted it.
 
         Args:
             live: the live frame.
             success: the accepted match.
-            found: the position by it.
             before: the position before it; None if unknown.
             alone_m: way that what the drive saved has hung on nothing, metres: a fix that nothing
                 predicts joins it to the map.
             certain: whether odometry since the last match had only short gaps.
         """
-        evidence = success.evidence
+        evidence, found = success.evidence, success.position
         assert evidence is not None
         predicted = math.isfinite(evidence.apart)
-        weak = success.match.inliers < confidence_of(live.descriptor).weak_inliers
-        leans = weak and certain and predicted and self.standing.agreed > 0
         before = self._chain.position or before
         fits = True if predicted else self._agrees(found, before if certain else None)
         alone = confidence_of(live.descriptor).alone(evidence)
@@ -125,7 +119,19 @@ class Prover:
             self._chain.join(live.stamp_ns, found, alone)
         self._told = self.told_otherwise = False
         self._record.fixed(success.match.inliers, agrees=fits is True)
-        return leans
+
+    def leans(self, live: Frame, success: Outcome, *, certain: bool) -> bool:
+        """Whether a fix is weak, and a position that earlier ones had confirmed predicted it.
+
+        Args:
+            live: the live frame.
+            success: the accepted match.
+            certain: whether odometry since the last match had only short gaps.
+        """
+        assert success.evidence is not None
+        weak = success.match.inliers < confidence_of(live.descriptor).weak_inliers
+        predicted = certain and math.isfinite(success.evidence.apart)
+        return weak and predicted and self.standing.agreed > 0
 
     def _agrees(self, found: Position, before: Position | None) -> bool | None:
         """Whether a match that nothing predicted agrees with a position; None if unknown."""
