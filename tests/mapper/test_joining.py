@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from tests.mapping_rig import map_simulated
 from tests.synthetic_world import PERIOD_NS, Seen, World, drive
 
 from engram.geometry import SE3
-from engram.maps import Map
+from engram.maps import Map, open_map
 from engram.odometry import OdometryStatus, OdometryStep
 
 STEP_M = 0.7
@@ -38,14 +39,28 @@ def one_after_another(*parts: list[Seen]) -> list[Seen]:
     return whole
 
 
-def parts_after(path: Path, *parts: list[Seen]) -> int:
+def map_recorded(path: Path, seen: list[Seen]) -> None:
+    map_simulated(path, seen, name="r2", rounds=4)
+
+
+def map_live(path: Path, seen: list[Seen]) -> None:
+    with (
+        open_map(path) as opened,
+        opened.robot(seen[0].frame.camera, name="r2", maps=True, policy="path", rounds=4) as robot,
+    ):
+        for one in seen:
+            robot.step(one.logged)
+
+
+def parts_after(path: Path, mapped: Callable[[Path, list[Seen]], None], *parts: list[Seen]) -> int:
     """Parts of the map of the street after a drive through other streets and a part of it."""
     map_simulated(path, along(STREET, 88.0))
-    map_simulated(path, one_after_another(*parts), name="r2", rounds=4)
+    mapped(path, one_after_another(*parts))
     with Map.open(path) as opened:
         return len(np.unique(opened.graph.components()))
 
 
+@pytest.mark.parametrize("mapped", [map_recorded, map_live])
 @pytest.mark.parametrize(
     ("alone_m", "alike_m", "parts"),
     [
@@ -57,8 +72,12 @@ def parts_after(path: Path, *parts: list[Seen]) -> int:
     ],
 )
 def test_a_drive_that_hung_on_nothing_joins_where_fixes_agree_along_a_share_of_it(
-    tmp_path: Path, alone_m: float, alike_m: float, parts: int
+    tmp_path: Path,
+    mapped: Callable[[Path, list[Seen]], None],
+    alone_m: float,
+    alike_m: float,
+    parts: int,
 ) -> None:
     path = tmp_path / "street.engram"
     before, alike, after = along(ELSEWHERE, alone_m), along(STREET, alike_m), along(BEYOND, 38.0)
-    assert parts_after(path, before, alike, after) == parts
+    assert parts_after(path, mapped, before, alike, after) == parts

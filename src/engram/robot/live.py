@@ -11,21 +11,18 @@ from typing import Protocol
 
 from engram.doctor import Finding
 from engram.errors import MapError, MapLockedError
-from engram.frontend import DescriptorKind, Frame, Frontend, StereoPair
+from engram.frontend import DescriptorKind, Frontend, StereoPair
 from engram.geometry import StereoCamera
 from engram.graph.model import Clock, Session, SessionId, path_id
 from engram.localiser import (
     KEEPS_NOTHING,
     UNNAMED_LIVE_SESSION,
-    Hint,
     Keeper,
-    Localisation,
     Localiser,
     Relocaliser,
 )
 from engram.mapper import Memory, Saver
 from engram.maps import Map
-from engram.odometry import Motion
 from engram.robot.front import Arrived
 from engram.robot.localisers import localiser_in
 from engram.robot.saved import Saving, SavingState
@@ -284,10 +281,11 @@ class IntoMemory:
         """See `Into`."""
 
 
-class LiveKeeper(Keeper):
-    """Keeps a live drive by another keeper, and stops keeping after a write error.
+class LiveDrive:
+    """A live drive: begun by its first frame, kept until an error or the doctor ends that.
 
-    The session begins with the first frame, which identifies the drive.
+    Nothing here forwards to the keeper: the robot asks the one that each method returns, and after
+    a write error or an unfit drive that is one that keeps nothing.
 
     Args:
         owner: the robot.
@@ -299,29 +297,41 @@ class LiveKeeper(Keeper):
         self.saving = saving or Saving(SavingState.ON)
         self._owner = owner
         self._into = into
-        self._keeper = KEEPS_NOTHING
 
-    def begin(self, first: Arrived) -> None:
-        """Begins the drive with this pair or logged frame."""
-        session = self._owner.session(first)
+    def begin(self, first: Arrived) -> Keeper:
+        """Begins the drive with this pair or logged frame; returns its keeper."""
+        session, keeper = self._owner.session(first), KEEPS_NOTHING
         self.saving.session = session.id
         try:
             if self.saving.state is not SavingState.FAILED:
-                self._keeper = self._into.begin(session, self._owner.made_by(first))
+                keeper = self._into.begin(session, self._owner.made_by(first))
         except MapError as error:
-            self._fail(error)
+            keeper = self.failed(error)
         if self.saving.state is SavingState.FAILED:
             # The map may hold this very drive: its nodes are then not the robot's own.
             session = replace(session, id=UNNAMED_LIVE_SESSION)
         self._into.localiser.begin(session)
+        return keeper
 
-    def examined(self, fatal: Sequence[Finding]) -> None:
-        """Stops keeping a drive that the doctor found unfit, and does not commit it."""
-        if fatal and not self._owner.options.force and self.saving.state is SavingState.ON:
-            try:
-                self._leave(fatal)
-            except MapError as error:
-                self._fail(error)
+    def failed(self, error: MapError) -> Keeper:
+        """A write failed: ends the saving, not the drive; returns the keeper from now on."""
+        self.saving.state, self.saving.reason = SavingState.FAILED, str(error)
+        return KEEPS_NOTHING
+
+    def examined(self, fatal: Sequence[Finding], keeper: Keeper) -> Keeper:
+        """The keeper from now on: a drive that the doctor found unfit is not committed.
+
+        Args:
+            fatal: what it found.
+            keeper: the keeper until now.
+        """
+        if not fatal or self._owner.options.force or self.saving.state is not SavingState.ON:
+            return keeper
+        try:
+            self._leave(fatal)
+        except MapError as error:
+            return self.failed(error)
+        return KEEPS_NOTHING
 
     def close(self, fatal: Sequence[Finding] = ()) -> None:
         """Ends the drive and commits it as a revision, unless the doctor found it unfit.
@@ -343,45 +353,14 @@ class LiveKeeper(Keeper):
                 self._into.end(self.saving, well=not failed)
         except MapError as error:
             if not failed:
-                self._fail(error)
+                self.failed(error)
                 raise
         finally:
             self._into.close()
 
-    def hint(self, live: Frame, motion: Motion) -> Hint | None:
-        """See `Keeper`."""
-        return self._keeper.hint(live, motion)
-
-    def may_propose(self, *, certain: bool) -> bool:
-        """See `Keeper`."""
-        return self._keeper.may_propose(certain=certain)
-
-    def may_propose_own(self, *, certain: bool) -> bool:
-        """See `Keeper`."""
-        return self._keeper.may_propose_own(certain=certain)
-
-    def keep(self, live: Frame, found: Localisation) -> Localisation:
-        """See `Keeper`; a write error ends the saving, not the drive."""
-        try:
-            found = self._keeper.keep(live, found)
-        except MapError as error:
-            self._fail(error)
-            return found
-        self.saving.nodes += found.saved is not None
-        return found
-
-    def withdrawn(self, found: Localisation) -> None:
-        """See `Keeper`."""
-        self._keeper.withdrawn(found)
-
     def _leave(self, fatal: Sequence[Finding]) -> None:
-        self._keeper = KEEPS_NOTHING
         self._into.leave(well=True)
         self.saving.state, self.saving.reason = SavingState.UNCOMMITTED, _reasons(fatal)
-
-    def _fail(self, error: MapError) -> None:
-        self._keeper = KEEPS_NOTHING
-        self.saving.state, self.saving.reason = SavingState.FAILED, str(error)
 
 
 def _reasons(fatal: Sequence[Finding]) -> str:

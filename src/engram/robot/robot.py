@@ -28,7 +28,7 @@ from engram.localiser.attempts import Outcome
 from engram.monitor import QUIET, Monitor, deferred_interrupt
 from engram.odometry import Motion, OdometryStatus, OdometryStep, OutsideMotion
 from engram.robot.front import Arrived, Front, arriving, check_position, paced, stamp_of
-from engram.robot.live import LiveKeeper
+from engram.robot.live import LiveDrive
 from engram.robot.recorder import Recorder
 from engram.robot.saved import Saving
 from engram.sequences.motion import MovedSequence
@@ -67,6 +67,7 @@ class Robot:
         front: front-end and odometry.
         localiser: localiser of this drive.
         keeper: keeps the results.
+        live: the live drive, which gives the keeper from its first frame on; None if it is not one.
         deadline_ms: latest start of an attempt after its frame arrived; None for no limit.
     """
 
@@ -76,15 +77,16 @@ class Robot:
         localiser: Localiser,
         keeper: Keeper = KEEPS_NOTHING,
         *,
+        live: LiveDrive | None = None,
         deadline_ms: float | None = None,
     ) -> None:
         self.last: Seen | None = None
         self._keeper = keeper
-        self._live = keeper if isinstance(keeper, LiveKeeper) else None
+        self._live = live
         self._front = front
         self._localiser = localiser
         self._deadline_ms = deadline_ms
-        self._saving = Saving() if self._live is None else self._live.saving
+        self._saving = Saving() if live is None else live.saving
         self._stamp_ns: int | None = None
         # Rising stamps of the newest frames that came too late.
         self._early_ns: list[int] = []
@@ -191,7 +193,7 @@ class Robot:
                 for earlier in self.track if found.withdraws else ():
                     if earlier.stamp_ns in found.withdraws:
                         self.withdraw(earlier)
-                found = self._keeper.keep(frame, found)
+                found = self._kept(frame, found)
             except MapError:
                 self._followed(arrived, motion)
                 raise
@@ -343,7 +345,7 @@ class Robot:
         waits = self._live is not None and not examination.full
         taken = self._front.take(arrived, motion, clock)
         if self._live is not None and waits and examination.full:
-            self._live.examined(self.diagnosis.fatal)
+            self._keeper = self._live.examined(self.diagnosis.fatal, self._keeper)
         return taken
 
     def _known(self, frame: Frame, motion: Motion) -> Localisation | None:
@@ -355,6 +357,17 @@ class Robot:
             self._localiser.place_at(hint.position, hint.open_loop_m, hint.guessed_m, hint.agreed)
         return hint.found
 
+    def _kept(self, frame: Frame, found: Localisation) -> Localisation:
+        """The result as its keeper completes it; a write error ends a live drive's saving alone."""
+        try:
+            found = self._keeper.keep(frame, found)
+        except MapError as error:
+            if self._live is None:
+                raise
+            self._keeper = self._live.failed(error)
+        self._saving.nodes += found.saved is not None
+        return found
+
     def _in_order(self, arrived: Arrived) -> bool:
         """Whether the stamp is later than the last one; the first frame begins a live drive."""
         stamp_ns, last_ns = stamp_of(arrived), self._stamp_ns
@@ -363,7 +376,7 @@ class Robot:
             if not self._set_back(stamp_ns):
                 return False
         elif last_ns is None and self._live is not None:
-            self._live.begin(arrived)
+            self._keeper = self._live.begin(arrived)
         self._early_ns.clear()
         self._stamp_ns = stamp_ns
         return True

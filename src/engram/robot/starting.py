@@ -11,7 +11,7 @@ from engram.maps import Map, open_map
 from engram.ranking import RankingPolicy
 from engram.robot.fixed import ToldFix, relocaliser_with_fixes, suggesting
 from engram.robot.front import Front
-from engram.robot.live import Into, IntoMap, IntoMemory, LiveKeeper, Owner
+from engram.robot.live import Into, IntoMap, IntoMemory, LiveDrive, Owner
 from engram.robot.localisers import localiser_in
 from engram.robot.robot import Robot
 from engram.robot.saved import Saving, SavingState
@@ -149,6 +149,6 @@ def _check_newest(opened: Map) -> None:
 def _keeping(
     owner: Owner, into: Into, front: Front | None = None, saving: Saving | None = None
 ) -> Robot:
-    keeper, deadline_ms = LiveKeeper(owner, into, saving), owner.options.deadline_ms
+    live, deadline_ms = LiveDrive(owner, into, saving), owner.options.deadline_ms
     front = front or Front(owner.settings, owner.camera)
-    return Robot(front, into.localiser, keeper, deadline_ms=deadline_ms)
+    return Robot(front, into.localiser, live=live, deadline_ms=deadline_ms)
