@@ -53,6 +53,7 @@ class Trial:
         lookup_ms_per_frame: of that, asking the relocaliser.
         lookups: frames for which it was asked.
         nodes: that were sent.
+        asked: what the part keeps of the settings that it was chosen by.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Trial:
     lookup_ms_per_frame: float
     lookups: int
     nodes: Sequence[Node]
+    asked: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +208,8 @@ def try_downloads(
                         robot.place_at(position)
                     results = list(robot.drive(open_drive(), part))
                     nodes = list(opened_part.graph.nodes)
-                own.append(_trial(name, session, report, results, nodes))
+                    asked_for = opened_part.log()[-1].configuration["download"]
+                own.append(_trial(name, session, report, results, nodes, asked_for))
                 out.unlink()
             trials += own
     return trials
@@ -218,6 +221,7 @@ def _trial(
     report: DownloadReport,
     results: Sequence[Localisation],
     nodes: Sequence[Node],
+    asked: Mapping[str, Any],
 ) -> Trial:
     """What came of a drive in a download."""
     lookups_ms = [one.stage_ms["places"] for one in results if "places" in one.stage_ms]
@@ -233,6 +237,7 @@ def _trial(
         lookup_ms_per_frame=sum(lookups_ms) / max(len(results), 1),
         lookups=len(lookups_ms),
         nodes=nodes,
+        asked=asked,
     )
 
 

@@ -47,7 +47,7 @@ def made_up_drive(number: int) -> EvaluatedDrive:
 
 def miss_share(one: Configuration) -> float:
     share = MISSES[one.policy] * (2.0 / min(one.lanes, 8)) ** 0.5
-    share *= 1.0 if one.T >= 5 else 1.5
+    share *= 1.0 if one.T is None or one.T >= 5 else 1.5
     return share * (1.0 if one.sessions is None else 1.0 + 2.0 / one.sessions)
 
 

@@ -217,29 +217,21 @@ def download(
       engram download fleet.engram r1.engram --select budget --budget 25% --depart 17:00
     """
     from engram.cli.progress import Bars
-    from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
+    from engram.fleet.download import budget_from_text, hour_from_text
     from engram.fleet.download import download as send
     from engram.fleet.download import update as take_in
     from engram.monitor import interruptible
 
     budget_bytes, budget_percent = budget_from_text(budget)
-    given = settings.read().download
-    asked = DownloadOptions(
-        policy=select,
+    asked = settings.read().download.options(
+        select,
         start_h=hour_from_text(depart, "depart"),
         end_h=hour_from_text(arrive, "arrive"),
         day=date,
-        latitude_deg=given.latitude_deg,
-        window_min=given.window_min,
-        epoch_min=given.epoch_min,
-        best_percent=given.best_percent,
-        buffer_min=given.buffer_min,
         budget_bytes=budget_bytes,
         budget_percent=budget_percent,
         near=tuple(near or ()),
         route=route,
-        radius_m=given.radius_m,
-        widen_min=given.widen_min,
         strict=strict,
         thumbnails=thumbnails,
     )

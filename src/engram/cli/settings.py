@@ -11,7 +11,7 @@ import typing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta
 
@@ -23,6 +23,9 @@ from engram.measures import Estimator
 from engram.repair.config import RepairConfig
 from engram.robot.islands import IslandsConfig
 from engram.robot.settings import Settings, settings_text
+
+if TYPE_CHECKING:
+    from engram.fleet.download import DownloadOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +103,13 @@ class DownloadSettings:
 
     def __post_init__(self) -> None:
         check_bounds(self)
+
+    def options(self, policy: str, **mission: Any) -> DownloadOptions:
+        """What to download by these settings; see `DownloadOptions` for what a mission is."""
+        from engram.fleet.download import DownloadOptions
+
+        own = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
+        return DownloadOptions(policy, **{**own, **mission})
 
 
 @dataclass(frozen=True, slots=True)

@@ -381,10 +381,12 @@ def _apart_m(a: SE3, b: SE3) -> float:
     return float(np.linalg.norm(a.translation - b.translation))
 
 
-def up_to_first_success(outcomes: Sequence[Outcome]) -> list[Outcome]:
-    """The outcomes in ranked order up to the first success: what one lane would have attempted."""
+def split_at_first_success(
+    outcomes: Sequence[Outcome],
+) -> tuple[list[Outcome], list[Outcome]]:
+    """What one lane would have attempted, up to the first success in ranked order; and the rest."""
     first = next((at for at, one in enumerate(outcomes) if one.accepted), len(outcomes))
-    return list(outcomes[: first + 1])
+    return list(outcomes[: first + 1]), list(outcomes[first + 1 :])
 
 
 def alternate(first: list[Candidate], second: list[Candidate]) -> list[Candidate]:

@@ -12,6 +12,8 @@ from engram.graph.graph import ExperienceGraph
 from engram.graph.model import ENGRAM_NAMESPACE, LandmarkSource, SessionId
 from engram.graph.neighbourhood import Neighbourhood
 from engram.graph.paths import PathMemory
+from engram.localiser.localisation import Budget
+from engram.localiser.settings import LocaliserConfig
 from engram.ranking import Background
 
 # For a drive without an id: equal input still gives equal results.
@@ -27,8 +29,9 @@ class MapParts:
         paths: the path memory.
         frames: where the landmarks of nodes come from.
         background: what policies may know about the map beyond its graph and paths.
-        search: finds the candidates; None for the graph's own `neighbourhood`. Localisers of one
-            drive on a fixed graph may share a search with a cache.
+        search: stands for the graph's own `neighbourhood`, such as one with a cache that the
+            localisers of one drive on a fixed graph share; None for that itself. It is not asked
+            where the settings want another search.
     """
 
     graph: ExperienceGraph
@@ -36,6 +39,21 @@ class MapParts:
     frames: LandmarkSource
     background: Background = field(default_factory=Background)
     search: Callable[..., Neighbourhood] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class InForce:
+    """By what a localiser localises.
+
+    Attributes:
+        policy: name of the ranking policy.
+        budget: attempts per frame.
+        config: its settings; neighbourhood, path entries and memory as its parts have them.
+    """
+
+    policy: str
+    budget: Budget
+    config: LocaliserConfig
 
 
 @dataclass(frozen=True, slots=True)

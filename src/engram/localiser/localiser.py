@@ -25,12 +25,12 @@ from engram.localiser.attempts import (
     Matcher,
     Outcome,
     alternate,
-    up_to_first_success,
+    split_at_first_success,
 )
 from engram.localiser.choice import best_success, uncontested
 from engram.localiser.confidence import confidence_of
 from engram.localiser.fusing import Track
-from engram.localiser.given import LiveDrive, MapParts
+from engram.localiser.given import InForce, LiveDrive, MapParts
 from engram.localiser.hypotheses import Hypotheses
 from engram.localiser.keeper import KEEPS_NOTHING, Keeper
 from engram.localiser.lenses import Lenses
@@ -43,7 +43,12 @@ from engram.localiser.localisation import (
 )
 from engram.localiser.proving import Prover
 from engram.localiser.relocalisation import Relocaliser
-from engram.localiser.settings import LocaliserConfig, NeighbourhoodSearch, Success
+from engram.localiser.settings import (
+    LocaliserConfig,
+    NeighbourhoodSearch,
+    PathEntries,
+    Success,
+)
 from engram.localiser.tried import Tried
 from engram.odometry import UNMOVED, Motion, OdometryStatus
 from engram.processes import cores
@@ -101,7 +106,7 @@ class Localiser:
         self._policy = policy
         self._budget = budget
         self._relocaliser = relocaliser
-        self._search = known.search or self._own_search()
+        self._search = self._search_of(known)
         # On one core each hand-over between threads would only cost.
         lanes = min(budget.lanes, threads or budget.lanes) if cores() > 1 else 1
         self._attempter = Attempter(known.frames, self.config, matcher, lanes)
@@ -124,6 +129,8 @@ class Localiser:
         # Variance of the motion guessed since the robot last knew where it was, m².
         self._guessed_m2 = 0.0
         self._outcomes: list[Outcome] = []
+        # Attempts of the last frame that its first success made useless.
+        self._beyond: list[Outcome] = []
         # Reference node and neighbourhood of the last frame's attempts.
         self._reference: NodeId | None = None
         self._near: Neighbourhood | None = None
@@ -170,6 +177,27 @@ class Localiser:
     def outcomes(self) -> list[Outcome]:
         """Outcomes of the attempts for the last frame, in ranked order."""
         return self._outcomes
+
+    @property
+    def attempted(self) -> list[Outcome]:
+        """The same, and those of its lanes that the first success of the frame made useless."""
+        return [*self._outcomes, *self._beyond]
+
+    @property
+    def neighbourhood(self) -> Neighbourhood | None:
+        """Candidates Y of the last frame; None if it was not usable or nothing was known."""
+        return self._near
+
+    @property
+    def in_force(self) -> InForce:
+        """By what it localises, read from its parts."""
+        found = replace(
+            self.config,
+            neighbourhood=self._searched_by(),
+            path_entries=PathEntries.of(self._paths.kinds),
+            recent=self._tried.config,
+        )
+        return InForce(self._policy.name, self._budget, found)
 
     def best_matched(self) -> Frame | None:
         """The node's frame that the last one matched best, right or not; none of its own drive."""
@@ -284,7 +312,7 @@ class Localiser:
             IncompatibleError: the map was made with another kind of descriptor.
         """
         clock = clock or StageClock()
-        self._new_damaged, self._near, self._looked_up = (), None, False
+        self._new_damaged, self._near, self._looked_up, self._beyond = (), None, False, []
         self._tried.begin_frame(self._driven_m)
         self._prover.begin_frame(self._motion.odometry.inliers)
         outcomes: list[Outcome] = []
@@ -303,7 +331,8 @@ class Localiser:
                 if any(outcome.accepted for outcome in outcomes):
                     break
             if self.config.success is Success.FIRST:
-                outcomes = up_to_first_success(outcomes)
+                outcomes, beyond = split_at_first_success(outcomes)
+                self._beyond = [one for one in beyond if not one.damaged]
             outcomes = self._judged(live, outcomes)
             clock.lap("attempts")
             self._tried.add(live, self._driven_m, self._near, outcomes)
@@ -378,10 +407,15 @@ class Localiser:
         depth_m = self.config.lens_depth_m
         return Lenses(self._graph, sessions, cameras, self._basin.focal_px, depth_m)
 
-    def _own_search(self) -> Callable[..., Neighbourhood]:
+    def _search_of(self, known: MapParts) -> Callable[..., Neighbourhood]:
         if self.config.neighbourhood is NeighbourhoodSearch.BREADTH_FIRST:
             return partial(breadth_first, self._graph)
-        return self._graph.neighbourhood
+        return known.search or self._graph.neighbourhood
+
+    def _searched_by(self) -> NeighbourhoodSearch:
+        if getattr(self._search, "func", None) is breadth_first:
+            return NeighbourhoodSearch.BREADTH_FIRST
+        return NeighbourhoodSearch.SUREST
 
     def _neighbourhood(self) -> Neighbourhood | None:
         return None if self.position is None else self._nodes_near(self.position)
@@ -573,8 +607,8 @@ class Localiser:
         return Localisation(
             stamp_ns=live.stamp_ns,
             status=self._status_without_match() if node is None else LocalisationStatus.LOCALISED,
-            attempts=len(self._outcomes),
-            proposed=sum(one.candidate.prediction is None for one in self._outcomes),
+            attempts=len(self.attempted),
+            proposed=sum(one.candidate.prediction is None for one in self.attempted),
             candidates=0 if self._near is None else len(self._near),
             motion=self._motion,
             open_loop_m=self._open_loop_m,

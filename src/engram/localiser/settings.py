@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from typing import Annotated
@@ -13,6 +14,8 @@ from engram.config import check_bounds
 from engram.errors import ConfigError
 from engram.frontend.matching import MatcherConfig
 from engram.graph.basin import BasinConfig
+from engram.graph.model import PathEntryKind
+from engram.graph.paths import ALL_KINDS, MATCHES_ONLY
 from engram.localiser.acceptance import AcceptanceConfig
 from engram.ranking import RecentConfig
 from engram.ranking.lessons import LessonsConfig
@@ -34,6 +37,16 @@ class PathEntries(StrEnum):
 
     ALL = "all"
     MATCHES = "matches"
+
+    @property
+    def kinds(self) -> frozenset[PathEntryKind]:
+        """The kinds of entry that count."""
+        return MATCHES_ONLY if self is PathEntries.MATCHES else ALL_KINDS
+
+    @staticmethod
+    def of(kinds: Collection[PathEntryKind]) -> PathEntries:
+        """The setting by which these kinds count."""
+        return PathEntries.MATCHES if frozenset(kinds) == MATCHES_ONLY else PathEntries.ALL
 
 
 class Success(StrEnum):

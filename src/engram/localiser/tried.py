@@ -34,6 +34,11 @@ class Tried:
         self._run = RunLog()
 
     @property
+    def config(self) -> RecentConfig:
+        """How far back the last iterations reach."""
+        return self._config
+
+    @property
     def iteration(self) -> int:
         """Number of the current iteration."""
         return self._recent.iteration

@@ -209,7 +209,7 @@ class GapFiller:
     """
 
     def __init__(self, config: GapConfig = GapConfig()) -> None:
-        self._config = config
+        self.config = self._config = config
         # x, y, z in m/s each, in the camera that they begin in; the newest last.
         self._velocities: deque[list[float]] = deque(maxlen=self._config.speed_steps)
         # Their median.

@@ -14,7 +14,6 @@ from engram.graph.basin import MatchBasin
 from engram.graph.clock import Clocked
 from engram.graph.model import Session, SessionId, path_id
 from engram.graph.neighbourhood import Neighbourhood
-from engram.graph.paths import MATCHES_ONLY, PathMemory
 from engram.localiser import (
     RELOCALISERS,
     UNNAMED_LIVE_SESSION,
@@ -25,7 +24,7 @@ from engram.localiser import (
     Matcher,
     Relocaliser,
 )
-from engram.localiser.settings import LocaliserConfig, PathEntries
+from engram.localiser.settings import LocaliserConfig
 from engram.maps import Map
 from engram.places.words import words_of
 from engram.ranking import (
@@ -50,7 +49,6 @@ class LocaliserParts(TypedDict, total=False):
         threads: how many threads the lanes share; None for one each.
         matcher, search: replace the default ones; see `Localiser` and `MapParts`.
         clock: time zone and location of its stamps; None if unknown.
-        path_memory: replaces that of the map.
     """
 
     policy: str | RankingPolicy
@@ -62,7 +60,6 @@ class LocaliserParts(TypedDict, total=False):
     threads: int | None
     search: Callable[..., Neighbourhood] | None
     clock: Clocked | None
-    path_memory: PathMemory | None
 
 
 def localiser_in(
@@ -92,7 +89,7 @@ def localiser_in(
     )
     if uses_words(ranking):
         words.prepare()
-    paths = parts.get("path_memory") or _counted_paths(opened, settings)
+    paths = opened.path_memory.counting(settings.localiser.path_entries.kinds)
     return Localiser(
         MapParts(opened.graph, paths, opened.frames, background, parts.get("search")),
         LiveDrive(
@@ -110,13 +107,6 @@ def localiser_in(
         matcher=parts.get("matcher"),
         threads=parts.get("threads"),
     )
-
-
-def _counted_paths(opened: Map, settings: Settings) -> PathMemory:
-    """The map's paths, with the kinds of entry that the settings count."""
-    if settings.localiser.path_entries is PathEntries.MATCHES:
-        return opened.path_memory.counting(MATCHES_ONLY)
-    return opened.path_memory
 
 
 def relocaliser_in(opened: Map, name: str, descriptor: DescriptorKind) -> Relocaliser:

@@ -25,6 +25,7 @@ from engram.localiser import (
     StageClock,
 )
 from engram.localiser.attempts import Outcome
+from engram.localiser.given import InForce
 from engram.monitor import QUIET, Monitor, deferred_interrupt
 from engram.odometry import Motion, OdometryStatus, OdometryStep, OutsideMotion
 from engram.robot.front import Arrived, Front, arriving, check_position, paced, stamp_of
@@ -124,6 +125,11 @@ class Robot:
     def outcomes(self) -> list[Outcome]:
         """Outcomes of the attempts for the last frame, in ranked order."""
         return self._localiser.outcomes
+
+    @property
+    def in_force(self) -> InForce:
+        """By what it localises, read from its parts."""
+        return self._localiser.in_force
 
     @property
     def graph(self) -> ExperienceGraph:

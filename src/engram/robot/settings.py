@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
+from typing import Self
 
 from engram.config import load_toml
 from engram.doctor.settings import DoctorConfig
@@ -36,7 +37,7 @@ class Settings:
     gaps: GapConfig = field(default_factory=GapConfig)
     placing: PlacingConfig = field(default_factory=PlacingConfig)
 
-    def for_descriptor(self, descriptor: DescriptorKind | None) -> Settings:
+    def for_descriptor(self, descriptor: DescriptorKind | None) -> Self:
         """These settings for a map's kind of descriptor; None keeps their own.
 
         Matcher settings that are not set explicitly become the defaults of that kind.

@@ -27,7 +27,15 @@ def relocalise(
         ),
     ] = "fabmap",
     drive: options.Drive,
-    lanes: options.Lanes = 2,
+    lanes: Annotated[
+        int | None,
+        typer.Option(
+            "--lanes",
+            metavar="N",
+            min=1,
+            help="Match attempts in parallel (Np) [default: as in the settings].",
+        ),
+    ] = None,
     rounds: options.Rounds = 32,
     at: options.At = None,
     config: options.Settings = None,
@@ -47,13 +55,13 @@ def relocalise(
     from engram.localiser import Budget
     from engram_lab.relocalising import relocalise_drive, summarise_cold_starts
 
-    sequence = drive.open(path)
+    sequence, given = drive.open(path), read_settings(config)
     starts = relocalise_drive(
         map_path,
         sequence,
-        read_settings(config).of_robot(),
+        given.of_robot(),
         relocaliser=relocaliser,
-        budget=Budget(lanes, lost_rounds=rounds),
+        budget=Budget(lanes or given.drive.lanes, lost_rounds=rounds),
         at=at,
         monitor=Bars(),
     )
@@ -156,7 +164,7 @@ def try_(
       engram lab try fleet.engram monday.framelog tuesday.framelog --select budget --budget 25%
     """
     from engram.cli.progress import Bars
-    from engram.fleet.download import DownloadOptions, budget_from_text, hour_from_text
+    from engram.fleet.download import budget_from_text, hour_from_text
     from engram.robot import RobotOptions, open_drive, session_of_drive
     from engram_lab.trial import (
         LeftOut,
@@ -168,16 +176,13 @@ def try_(
 
     budget_bytes, budget_percent = budget_from_text(budget)
     given = settings.read()
-    asked = DownloadOptions(
+    if window is not None:
+        given = replace(given, download=replace(given.download, window_min=window))
+    asked = given.download.options(
+        policy,
         strict="tod" in policy or policy == "paths",  # an hour without data is a row of its own
-        policy=policy,
         start_h=hour_from_text(start, "start"),
         end_h=hour_from_text(end, "end"),
-        latitude_deg=given.download.latitude_deg,
-        window_min=given.download.window_min if window is None else window,
-        epoch_min=given.download.epoch_min,
-        best_percent=given.download.best_percent,
-        buffer_min=given.download.buffer_min,
         budget_bytes=budget_bytes,
         budget_percent=budget_percent,
     )
@@ -187,7 +192,7 @@ def try_(
     left_out: list[LeftOut] = []
     trials = try_downloads(
         centre,
-        {asked.policy: asked, "copy": DownloadOptions()},
+        {asked.policy: asked, "copy": given.download.options("copy")},
         [partial(open_drive, drive) for drive in drives],
         given.of_robot(),
         RobotOptions(**effort.over(given)),

@@ -160,9 +160,13 @@ def ranking(
         ),
     ] = None,
     rounds: Annotated[
-        str,
-        typer.Option("--rounds", metavar="N,N…", help="Values of Nr; the first for all policies."),
-    ] = "1,2",
+        str | None,
+        typer.Option(
+            "--rounds",
+            metavar="N,N…",
+            help="Values of Nr; the first for all policies [default: 1,2].",
+        ),
+    ] = None,
     map_sizes: Annotated[
         bool,
         typer.Option(
@@ -197,6 +201,7 @@ def ranking(
     Examples:
       engram lab evaluate ranking hamlet --policies distance,path --lanes 1,2 --folds 3
       engram lab evaluate ranking begbroke keble oxford --out results/ranking
+      engram lab evaluate ranking begbroke --config linegar2015
       engram lab evaluate ranking begbroke --policies distance,path,recall --only-folds 0
       engram lab evaluate ranking monday.framelog tuesday.framelog … --out results/mine
     """
@@ -213,10 +218,14 @@ def ranking(
         write_report,
     )
 
+    started, settings = time.perf_counter(), read_settings(study.config).for_descriptor(None)
+    drive = settings.drive
     asked = RankingOptions(
-        policies=tuple(policies.split(",") if policies else STUDIED),
-        lanes=tuple(n or UNLIMITED for n in numbers(lanes, "--lanes")) if lanes else DEFAULT_LANES,
-        rounds=numbers(rounds, "--rounds"),
+        policies=tuple(policies.split(",")) if policies else (*STUDIED, drive.ranking),
+        lanes=tuple(n or UNLIMITED for n in numbers(lanes, "--lanes"))
+        if lanes
+        else (*DEFAULT_LANES, drive.lanes),
+        rounds=numbers(rounds, "--rounds") if rounds else (1, 2, drive.rounds),
         folds=study.folds,
         seed=study.seed,
         map_sizes=map_sizes,
@@ -225,7 +234,6 @@ def ranking(
         only_folds=study.chosen_folds,
     )
     again = _redone(redo, asked.policies, report_only=study.report_only)
-    started, settings = time.perf_counter(), read_settings(study.config).of_robot()
     plans = [make_plan(one, settings, asked, study.folder) for one in study.drive_sets(settings)]
     for plan in [] if study.report_only else plans:
         forget(plan, again)
@@ -239,14 +247,15 @@ def fleet(
     *,
     study: _Study,
     arms: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--arms",
             metavar="X,X…",
             help="A: distance, 8 attempts per frame; B: recall, 8 attempts; C: all candidates; "
-            "P: A, but every match omits its node, as in the paper.",
+            "P: A, but every match omits its node; S: as the settings say [default: A,B,C; S where "
+            "the settings rank or merge otherwise].",
         ),
-    ] = "A,B,C",
+    ] = None,
     experiments: Annotated[
         str,
         typer.Option("--experiments", metavar="N,N…", help="Figures of Gadd and Newman (2016)."),
@@ -269,7 +278,12 @@ def fleet(
         ),
     ] = None,
     relocaliser: Annotated[
-        str, typer.Option("--relocaliser", metavar="NAME", help="How lost robots are found.")
+        str,
+        typer.Option(
+            "--relocaliser",
+            metavar="NAME",
+            help="How lost robots are found; merges have merge.relocaliser.",
+        ),
     ] = "fabmap",
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for tables and figures.")
@@ -285,20 +299,23 @@ def fleet(
       engram lab evaluate fleet village --arms A --experiments 7,9
       engram lab evaluate fleet begbroke24h --out results/fleet
       engram lab evaluate fleet begbroke24h --arms A --experiments 7,9 --only-folds 0
+      engram lab evaluate fleet begbroke24h --config gadd2016
       engram lab evaluate fleet begbroke24h --report-only
     """
     from engram.cli.progress import Bars
     from engram.cli.settings import read_settings
     from engram_lab.studies.fleet import (
         FleetOptions,
+        arms_for,
         make_fleet_plan,
         run_fleet,
         write_fleet_report,
     )
 
+    started, settings = time.perf_counter(), read_settings(study.config).for_descriptor(None)
     counts = numbers(groups, "--groups")
     asked = FleetOptions(
-        arms=tuple(arms.split(",")),
+        arms=tuple(arms.split(",")) if arms else arms_for(settings),
         experiments=numbers(experiments, "--experiments"),
         folds=study.folds,
         seed=study.seed,
@@ -308,7 +325,6 @@ def fleet(
         relocaliser=None if relocaliser == "none" else relocaliser,
         only_folds=study.chosen_folds,
     )
-    started, settings = time.perf_counter(), read_settings(study.config).of_robot()
     plans = [
         make_fleet_plan(one, settings, asked, study.folder) for one in study.drive_sets(settings)
     ]

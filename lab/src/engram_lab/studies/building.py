@@ -7,7 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from engram.maps import Map
 from engram.robot import Beginning, MapReport, RobotOptions, Settings, map_drive
 from engram.sequences import FrameLog
 from engram_lab.studies.drives import EvaluatedDrive
+from engram_lab.studies.in_force import Values, of_revision, of_robot
 from engram_lab.studies.starting import TrueNodes
 
 # Enough for every candidate that matters; counts only, so that the same drives give the same map.
@@ -58,10 +59,12 @@ class BuiltMap:
     Attributes:
         path: the file.
         sessions: as they were added, in the order of time.
+        in_force: what its newest drive was mapped by.
     """
 
     path: Path
     sessions: list[BuiltSession] = field(default_factory=list)
+    in_force: Values = field(default_factory=dict)
 
     def revision_after(self, sessions: int) -> int:
         """The revision that holds the first so many training sessions."""
@@ -104,7 +107,7 @@ def build_map(
         before = path if built.sessions else base
         if before is not None:
             shutil.copyfile(before, draft)
-        begin = partial(_place, drive=drive, drives=(*drives, *known))
+        begin = partial(_begin, built, drive=drive, drives=(*drives, *known))
         log = FrameLog(drive.path)
         try:
             report = map_drive(draft, log, settings, options, begin=begin)
@@ -116,9 +119,11 @@ def build_map(
         if look_at is not None:
             look_at(drive, report)
         built.sessions.append(_built_session(draft, drive, report, seconds))
+        built.in_force = {**newest_in_force(draft), **built.in_force}
         # The record first: where a run is killed between the two it is ahead of the map, and what
         # it is ahead by is done again.
-        write_json(path.with_suffix(".json"), {"sessions": to_dict(built.sessions)})
+        recorded = {"sessions": to_dict(built.sessions), "in_force": built.in_force}
+        write_json(path.with_suffix(".json"), recorded)
         draft.replace(path)
         _remove(draft)
     return built
@@ -151,7 +156,7 @@ def read_built_map(path: Path) -> BuiltMap:
         return BuiltMap(path)
     with Map.open(path) as store:
         newest = store.revision
-    return BuiltMap(path, [one for one in recorded.sessions if one.revision <= newest])
+    return replace(recorded, sessions=[one for one in recorded.sessions if one.revision <= newest])
 
 
 def read_record(path: Path) -> BuiltMap:
@@ -164,13 +169,28 @@ def read_record(path: Path) -> BuiltMap:
     if not record.exists():
         return BuiltMap(path)
     try:
-        known = json.loads(record.read_text(encoding="utf-8"))["sessions"]
-        return BuiltMap(path, [BuiltSession(**one) for one in known])
+        known = json.loads(record.read_text(encoding="utf-8"))
+        sessions = [BuiltSession(**one) for one in known["sessions"]]
+        return BuiltMap(path, sessions, dict(known.get("in_force", {})))
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(
             f"{record} does not tell how far {path.name} is ({error}); remove both, and the same "
             "command builds the map again"
         ) from error
+
+
+def newest_in_force(path: Path) -> Values:
+    """What a map keeps of how its newest revision was made."""
+    with Map.open(path) as store:
+        return of_revision(store.log()[-1].configuration)
+
+
+def _begin(
+    built: BuiltMap, begun: Beginning, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]
+) -> None:
+    """Notes what the robot runs by, and tells it its place."""
+    built.in_force = of_robot(begun.robot)
+    _place(begun, drive, drives)
 
 
 def _place(begun: Beginning, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]) -> None:

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from enum import StrEnum
 from typing import Any
 
-from engram.graph.model import PathEntryKind
-from engram.graph.paths import ALL_KINDS, MATCHES_ONLY
-from engram.localiser import Budget
-from engram.ranking import RecentConfig
+from engram.localiser import Budget, LocaliserConfig
+from engram.localiser.settings import PathEntries
 
 # Lanes of a budget that never runs out.
 UNLIMITED = 1_000_000
 DEFAULT_LANES = (1, 2, 3, 4, 6, 8, 12, 16, UNLIMITED)
 # Source: [L15] Fig. 13.
 T_SWEEP = (0, 1, 2, 5, 10, 20, 50, 100, 200)
-DEFAULT_T = RecentConfig().T
 # The budget of [L15]'s Figs. 9, 12 and 13.
 FEW_LANES = 2
 # Policies whose second round is measured too.
@@ -39,31 +36,47 @@ class PathKinds(StrEnum):
     MATCHED = "matched"  # [L15 §IV]'s text
 
     @property
-    def kinds(self) -> frozenset[PathEntryKind]:
-        """As path memory wants them."""
-        return ALL_KINDS if self is PathKinds.ALL else MATCHES_ONLY
+    def entries(self) -> PathEntries:
+        """The setting that says so."""
+        return PathEntries.ALL if self is PathKinds.ALL else PathEntries.MATCHES
+
+    @property
+    def other(self) -> PathKinds:
+        """What the study varies it to."""
+        return PathKinds.MATCHED if self is PathKinds.ALL else PathKinds.ALL
+
+    @staticmethod
+    def of(config: LocaliserConfig) -> PathKinds:
+        """As the settings have it."""
+        return next(one for one in PathKinds if one.entries is config.path_entries)
 
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """One way to localise the held-out sessions.
+    """One way to localise the held-out sessions; where it says nothing, the settings do.
 
     Attributes:
         policy: name of a ranking policy.
         lanes, rounds: Np and Nr.
-        T: iterations remembered.
+        T: iterations remembered; None for those of the settings.
         radius: of the search for candidates.
-        paths: which entries count in path memory.
+        paths: which entries count in path memory; None for those of the settings.
         sessions: in the map after so many training sessions; None for all of them.
     """
 
     policy: str
     lanes: int = FEW_LANES
     rounds: int = 1
-    T: int = DEFAULT_T
+    T: int | None = None
     radius: Radius = Radius.SEARCH
-    paths: PathKinds = PathKinds.ALL
+    paths: PathKinds | None = None
     sessions: int | None = None
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether all but policy and budget are as in the settings."""
+        varies = self.T is not None or self.paths is not None
+        return not varies and self.radius is Radius.SEARCH
 
     @property
     def budget(self) -> Budget:
@@ -81,9 +94,17 @@ class Configuration:
         parts = [self.policy]
         if self.radius is Radius.BASIN:
             parts.append("radius = basin")
-        if self.paths is PathKinds.MATCHED:
-            parts.append("matched only")
+        if self.paths is not None:
+            parts.append("matched only" if self.paths is PathKinds.MATCHED else "saved, too")
         return ", ".join(parts)
+
+    def settings_over(self, config: LocaliserConfig) -> LocaliserConfig:
+        """The settings, changed as far as the configuration says otherwise."""
+        if self.T is not None:
+            config = replace(config, recent=replace(config.recent, T=self.T))
+        if self.paths is not None:
+            config = replace(config, path_entries=self.paths.entries)
+        return replace(config, search_radius_m=0.0) if self.radius is Radius.BASIN else config
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -94,9 +115,12 @@ class Configuration:
         """The reverse of `to_dict`."""
         known = {one.name for one in fields(Configuration)}
         plain = {name: value for name, value in values.items() if name in known}
-        return Configuration(
-            **{**plain, "radius": Radius(values["radius"]), "paths": PathKinds(values["paths"])}
-        )
+        paths = values["paths"]
+        typed = {
+            "radius": Radius(values["radius"]),
+            "paths": None if paths is None else PathKinds(paths),
+        }
+        return Configuration(**{**plain, **typed})
 
 
 # Attempts every candidate: shows what could have succeeded ([L15] Fig. 10) and whom the
@@ -108,6 +132,7 @@ def sweep(
     policies: Sequence[str],
     lanes: Sequence[int] = DEFAULT_LANES,
     rounds: Sequence[int] = (1, 2),
+    config: LocaliserConfig | None = None,
 ) -> tuple[Configuration, ...]:
     """All that is run in the whole map: policy × Np, T, Nr = 2, and the variants of `path-near`.
 
@@ -115,7 +140,10 @@ def sweep(
         policies: names of ranking policies.
         lanes: Np; `UNLIMITED` for as many attempts as there are candidates.
         rounds: Nr; rounds beyond the first are run for `TWO_ROUNDS` only.
+        config: the settings, from which the variants differ; None for the defaults.
     """
+    config = config or LocaliserConfig()
+    other = PathKinds.of(config).other
     found: dict[Configuration, None] = {}
 
     def add(some: Iterable[Configuration]) -> None:
@@ -130,12 +158,13 @@ def sweep(
         limited = [np for np in lanes if np != UNLIMITED]
         add(Configuration(one, np, nr) for one in policies if one in TWO_ROUNDS for np in limited)
     if "path-near" in policies:
-        add(Configuration("path-near", few, rounds[0], T) for T in T_SWEEP)
-        add(Configuration("path-near", np, rounds[0], paths=PathKinds.MATCHED) for np in lanes)
+        swept = (None if T == config.recent.T else T for T in T_SWEEP)
+        add(Configuration("path-near", few, rounds[0], T) for T in swept)
+        add(Configuration("path-near", np, rounds[0], paths=other) for np in lanes)
     for policy in PATH_POLICIES:
         if policy in policies:
             add([Configuration(policy, few, rounds[0], radius=Radius.BASIN)])
-            add([Configuration(policy, few, rounds[0], paths=PathKinds.MATCHED)])
+            add([Configuration(policy, few, rounds[0], paths=other)])
     return tuple(found)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from shlex import quote
@@ -17,7 +17,7 @@ from engram.graph.model import Session
 from engram.robot import Settings, session_of_drive
 from engram.sequences import FrameLog, LoggedFrame
 from engram.sequences.trajectories import Trajectory
-from engram_lab.town import Campaign, Size, campaign_named
+from engram_lab.town import WORLD_VERSION, Campaign, Size, campaign_named
 from engram_lab.town.simulating import campaign_folder
 from engram_lab.town.upkeep import Upkeep, bring_up_to_date, first_look
 from engram_lab.truth import read_truth, truth_path
@@ -35,6 +35,7 @@ class EvaluatedDrive:
         frontend, odometry: hashes of the front-end and the odometry that made it.
         truth_hash: of its true poses, which stand beside it; None where there are none. Those of
             all drives of an evaluation are in one world frame.
+        world: version of the simulated world that it was rendered in; None for other drives.
     """
 
     path: Path
@@ -44,6 +45,7 @@ class EvaluatedDrive:
     frontend: str
     odometry: str
     truth_hash: str | None
+    world: int | None = None
 
     @property
     def name(self) -> str:
@@ -155,7 +157,7 @@ def open_campaign(
     same = [one.path for one in drives if one.frontend in ours]
     if {bring_up_to_date(path, settings) for path in same} - {Upkeep.KEPT}:
         drives = drives_of(paths)
-    return DriveSet(text, drives)
+    return DriveSet(text, tuple(replace(one, world=WORLD_VERSION) for one in drives))
 
 
 def campaign_logs(campaign: Campaign, campaigns: Path) -> list[Path]:

@@ -25,6 +25,7 @@ def localise_held_out(
     settings: Settings,
     matcher: Matcher | None,
     relocaliser: str | None,
+    threads: int | None = None,
 ) -> Runs:
     """Localises a drive with every configuration, from the node nearest by truth.
 
@@ -40,6 +41,7 @@ def localise_held_out(
         settings: the resolved configuration.
         matcher: makes the matches, unguided; None for the localiser's own, guided ones.
         relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near.
+        threads: most threads that a robot's lanes share; None for one each.
     """
     nodes, truth = true_nodes(opened, training), drive.truth()
     first = None if truth is None else truth.at(frames[0].frame.stamp_ns)
@@ -56,4 +58,4 @@ def localise_held_out(
         )
     situation = Situation(opened, drive, frames, start, nodes, truth)
     cost = (lambda: matcher.seconds) if isinstance(matcher, MatchMemo) else (lambda: 0.0)
-    return run_in_step(situation, configurations, settings, matcher, relocaliser, cost)
+    return run_in_step(situation, configurations, settings, matcher, relocaliser, cost, threads)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter, thread_time
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,22 +14,22 @@ from numpy.typing import NDArray
 from engram.frontend import Frame
 from engram.geometry import SE3
 from engram.graph.basin import DEFAULT_RADIUS_M
-from engram.graph.model import NodeId, PathEntryKind
+from engram.graph.model import NodeId
 from engram.graph.neighbourhood import Neighbourhood, Search
-from engram.graph.paths import PathMemory
-from engram.localiser import Hint, Keeper, Matcher, Position
+from engram.localiser import Hint, Keeper, Localisation, Localiser, Matcher, Position
 from engram.maps import Map
 from engram.odometry import GapFiller, Motion, driven_steps_m
 from engram.robot import Front, Robot, Settings
-from engram.robot.localisers import localiser_in
+from engram.robot.localisers import LocaliserParts, localiser_in
 from engram.sequences import LoggedFrame
-from engram_lab.studies.configurations import EVERYTHING, Configuration, PathKinds, Radius
+from engram_lab.studies.configurations import EVERYTHING, Configuration
 from engram_lab.studies.drives import EvaluatedDrive, Truth
+from engram_lab.studies.in_force import Values, of_localiser
 from engram_lab.studies.starting import TrueNodes
 
 
 class SharedSearch:
-    """A graph's neighbourhood search that remembers this frame's answers.
+    """A graph's own neighbourhood search that remembers this frame's answers.
 
     Localisers that matched the same node stand at the same position to the bit, whatever their
     policies: they ask the same.
@@ -73,14 +74,15 @@ class Runs:
         step_m: (F,) float64, distance of the step that ends in the frame: by odometry, guessed
             where that failed.
         matched: (C, F) bool, whether the frame was localised.
-        attempts: (C, F) int32, match attempts.
+        attempts: (C, F) int32, match attempts made.
         candidates: (C, F) int32, |Y|.
-        succeeded: (C, F) int32, attempts that were accepted.
+        succeeded: (C, F) int32, attempts that were accepted, also where the first one counts.
         near, near_seen: (C, F) int32, nodes truly within 8 m and 60° of a localised robot, and
-            those of them that were candidates; counted for `EVERYTHING` only, else 0.
+            those of them that were candidates, in Y; counted for `EVERYTHING` only, else 0.
         offset_m, turn_rad: (C, F) float32, error of the pose of a success; NaN without one, or
             without truth.
         step_ms: (C,) float64, mean time of a frame; with a memo without the making of new matches.
+        in_force: of each configuration, what its localiser ran by.
     """
 
     configurations: tuple[Configuration, ...]
@@ -94,9 +96,14 @@ class Runs:
     offset_m: NDArray[np.float32]
     turn_rad: NDArray[np.float32]
     step_ms: NDArray[np.float64]
+    in_force: tuple[Values, ...]
 
     @staticmethod
-    def empty(configurations: Sequence[Configuration], step_m: NDArray[np.float64]) -> Runs:
+    def empty(
+        configurations: Sequence[Configuration],
+        step_m: NDArray[np.float64],
+        in_force: Sequence[Values] | None = None,
+    ) -> Runs:
         """Nothing run yet."""
         shape = (len(configurations), len(step_m))
         return Runs(
@@ -111,6 +118,7 @@ class Runs:
             offset_m=np.full(shape, np.nan, np.float32),
             turn_rad=np.full(shape, np.nan, np.float32),
             step_ms=np.zeros(shape[0]),
+            in_force=tuple(in_force or ({} for _ in configurations)),
         )
 
 
@@ -136,6 +144,13 @@ class Situation:
     truth: Truth | None
 
 
+class _Running(NamedTuple):
+    """One configuration's robot, and its localiser."""
+
+    robot: Robot
+    localiser: Localiser
+
+
 def run_in_step(
     situation: Situation,
     configurations: Sequence[Configuration],
@@ -143,6 +158,7 @@ def run_in_step(
     matcher: Matcher | None,
     relocaliser: str | None = None,
     cost_so_far: Callable[[], float] = lambda: 0.0,
+    threads: int | None = None,
 ) -> Runs:
     """Localises the drive with every configuration, frame by frame.
 
@@ -153,43 +169,65 @@ def run_in_step(
         matcher: makes the matches, unguided; None for the localiser's own, guided ones.
         relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near.
         cost_so_far: seconds spent in making matches; left out of `step_ms`.
+        threads: most threads that a robot's lanes share; None for one each.
     """
     frames = situation.frames
     # With a memo everything runs on this thread, beside other workers on a busy machine; as on a
     # robot, on several threads, the time until the answer counts.
     clock = perf_counter if matcher is None else thread_time
-    gaps = GapFiller()
+    gaps = GapFiller(settings.gaps)
     motions = [gaps.motion(one.odometry, one.frame.stamp_ns) for one in frames]
     step_m = driven_steps_m(motions, [one.frame.stamp_ns for one in frames])
-    runs = Runs.empty(configurations, step_m)
     search = SharedSearch(situation.opened.graph.neighbourhood)
-    with _robots(situation, configurations, settings, matcher, search, relocaliser) as robots:
+    parts = LocaliserParts(
+        matcher=matcher,
+        search=search,
+        relocaliser=relocaliser,
+        threads=threads,
+        live=situation.drive.session.id,
+        clock=situation.drive.session,
+    )
+    with _robots(situation, configurations, settings, parts) as running:
+        runs = Runs.empty(
+            configurations,
+            step_m,
+            [of_localiser(one.localiser, gaps, situation.drive, matcher) for one in running],
+        )
         for number, logged in enumerate(frames):
             if situation.start is None or number < situation.start[0]:
-                for robot in robots:
-                    robot.follow(logged, motion=motions[number])
+                for one in running:
+                    one.robot.follow(logged, motion=motions[number])
                 continue
             search.next_frame()
             judge = _Judge(situation, logged.frame)
-            for row, robot in enumerate(robots):
+            for row, one in enumerate(running):
                 started, made = clock(), cost_so_far()
-                found = robot.step(logged, motion=motions[number])
+                found = one.robot.step(logged, motion=motions[number])
                 seconds = clock() - started - (cost_so_far() - made)
                 runs.step_ms[row] += 1e3 * seconds
-                runs.matched[row, number] = found.node is not None
-                runs.attempts[row, number] = found.attempts
-                runs.candidates[row, number] = found.candidates
-                runs.succeeded[row, number] = sum(one.accepted for one in robot.outcomes)
-                if found.node is not None and found.node_from_live is not None:
-                    error = judge.error(found.node, found.node_from_live)
-                    runs.offset_m[row, number], runs.turn_rad[row, number] = error
-                    if configurations[row] == EVERYTHING:
-                        near = judge.near()
-                        seen = {one.candidate.node for one in robot.outcomes}
-                        runs.near[row, number] = len(near)
-                        runs.near_seen[row, number] = len(near & seen)
+                _note(runs, row, number, found, one.localiser, judge)
     runs.step_ms[:] /= max(len(frames), 1)
     return runs
+
+
+def _note(
+    runs: Runs, row: int, number: int, found: Localisation, localiser: Localiser, judge: _Judge
+) -> None:
+    """Writes down how one configuration localised one frame."""
+    runs.matched[row, number] = found.node is not None
+    runs.attempts[row, number] = found.attempts
+    runs.candidates[row, number] = found.candidates
+    runs.succeeded[row, number] = sum(one.accepted for one in localiser.attempted)
+    if found.node is None or found.node_from_live is None:
+        return
+    error = judge.error(found.node, found.node_from_live)
+    runs.offset_m[row, number], runs.turn_rad[row, number] = error
+    candidates = localiser.neighbourhood
+    if runs.configurations[row] == EVERYTHING and candidates is not None:
+        near = judge.near()
+        seen = {localiser.graph.node(int(index)).id for index in candidates.nodes}
+        runs.near[row, number] = len(near)
+        runs.near_seen[row, number] = len(near & seen)
 
 
 class _Placing(Keeper):
@@ -241,51 +279,22 @@ def _robots(
     situation: Situation,
     configurations: Iterable[Configuration],
     settings: Settings,
-    matcher: Matcher | None,
-    search: SharedSearch,
-    relocaliser: str | None,
-) -> Iterator[list[Robot]]:
+    parts: LocaliserParts,
+) -> Iterator[list[_Running]]:
     """One per configuration; in one map they share what is known of it."""
-    memories: dict[PathKinds, PathMemory] = {}
     with ExitStack() as stack:
-        front, keeper, robots = Front(settings), _Placing(situation), list[Robot]()
+        front, keeper, running = Front(settings), _Placing(situation), list[_Running]()
         for one in configurations:
-            if one.paths not in memories:
-                memories[one.paths] = _counting(situation.opened, one.paths.kinds)
-            localiser = localiser_in(
-                situation.opened,
-                situation.drive.camera,
-                _settings_for(settings, one, guided=matcher is None),
-                policy=one.policy,
-                budget=one.budget,
-                relocaliser=relocaliser,
-                live=situation.drive.session.id,
-                matcher=matcher,
-                search=search,
-                clock=situation.drive.session,
-                path_memory=memories[one.paths],
-            )
-            robots.append(stack.enter_context(Robot(front, localiser, keeper)))
-        yield robots
-
-
-def _counting(opened: Map, kinds: Collection[PathEntryKind]) -> PathMemory:
-    """The paths of a map where only these kinds of entry count."""
-    known = opened.path_memory
-    if frozenset(kinds) == known.kinds:
-        return known
-    counted = PathMemory(opened.graph, kinds)
-    for path in known.paths:
-        for entry in known.entries(path):
-            counted.add(entry)
-    return counted
+            own: LocaliserParts = {**parts, "policy": one.policy, "budget": one.budget}
+            asked = _settings_for(settings, one, guided=parts["matcher"] is None)
+            localiser = localiser_in(situation.opened, situation.drive.camera, asked, **own)
+            robot = stack.enter_context(Robot(front, localiser, keeper))
+            running.append(_Running(robot, localiser))
+        yield running
 
 
 def _settings_for(settings: Settings, configuration: Configuration, *, guided: bool) -> Settings:
-    localiser = settings.localiser
-    changed = replace(localiser, recent=replace(localiser.recent, T=configuration.T))
-    if configuration.radius is Radius.BASIN:
-        changed = replace(changed, search_radius_m=0.0)
+    localiser = configuration.settings_over(settings.localiser)
     if not guided:
-        changed = replace(changed, guide_below_m=0.0)
-    return replace(settings, localiser=changed)
+        localiser = replace(localiser, guide_below_m=0.0)
+    return replace(settings, localiser=localiser)

@@ -78,8 +78,13 @@ def chosen(rows: Iterable[Row], **wanted: Any) -> list[Row]:
     return [row for row in rows if all(row.get(key) == value for key, value in wanted.items())]
 
 
-def table(rows: Sequence[Row], columns: Mapping[str, str] | None = None) -> Iterator[str]:
-    """Markdown lines of some columns, by name and heading; without, of all that are not empty."""
+def table(
+    rows: Sequence[Row], columns: Mapping[str, str] | None = None, beside: str = ""
+) -> Iterator[str]:
+    """Markdown lines of some columns, by name and heading; without, of all that are not empty.
+
+    `beside` is a line below them that says what is in force.
+    """
     if columns is None:
         names = dict.fromkeys(name for row in rows for name in row)
         full = (name for name in names if any(row.get(name) not in (None, "") for row in rows))
@@ -89,7 +94,7 @@ def table(rows: Sequence[Row], columns: Mapping[str, str] | None = None) -> Iter
         yield _line("---" for _ in columns)
         for row in rows:
             yield _line(cell(row, name) for name in columns)
-        yield ""
+        yield from ("", beside, "") if beside else ("",)
 
 
 def pivot(rows: Iterable[Row], index: str, across: str, value: str) -> list[Row]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from engram import __version__
+from engram.cli.settings import AllSettings
 from engram.config import config_hash, to_dict
 from engram.errors import ConfigError
+from engram.frontend import DescriptorKind
 from engram.frontend.matching import matcher_hash
 from engram.localiser import METHOD_VERSION, RELOCALISERS
 from engram.monitor import Monitor
@@ -20,6 +22,10 @@ from engram_lab.studies.drives import DriveSet, EvaluatedDrive
 from engram_lab.studies.folds import Fold, check_only, chosen, split
 from engram_lab.studies.tasks import Task, run_tasks
 from engram_lab.studies.writing import alone_in, writing
+
+# Raise it whenever a study runs otherwise under equal settings, or keeps more of what it ran:
+# studies of before are not gone on with.
+_STUDY_VERSION = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,15 +62,17 @@ class StudyPlan(Generic[Options]):
 
     Attributes:
         drives: what is evaluated.
-        settings: the resolved configuration.
+        settings: the resolved configuration of its robots.
         options: what is run.
         work: folder of maps and results.
+        tables: the same with the tables of the verbs.
     """
 
     drives: DriveSet
     settings: Settings
     options: Options
     work: Path
+    tables: AllSettings = field(default_factory=AllSettings)
 
     @property
     def folds(self) -> tuple[Fold, ...]:
@@ -92,7 +100,7 @@ class StudyPlan(Generic[Options]):
             "drives_hash": self.drives.hash,
             "with_truth": self.drives.has_truth,
             "folds": [to_dict(one) for one in self.folds],
-            "settings": to_dict(self.settings),
+            "settings": to_dict(self.tables),
             "options": to_dict(self.options),
             "matcher": matcher_hash(self.settings.localiser.matcher),
             "machine": platform.machine(),
@@ -124,6 +132,15 @@ class StudyPlan(Generic[Options]):
             close()
 
 
+def all_tables(settings: Settings, descriptor: DescriptorKind) -> AllSettings:
+    """The settings of a study for a kind of descriptor; those of robots alone leave the verbs'."""
+    if not isinstance(settings, AllSettings):
+        settings = AllSettings(
+            **{one.name: getattr(settings, one.name) for one in fields(settings)}
+        )
+    return settings.for_descriptor(descriptor)
+
+
 def study_folder(work: Path, name: str, depends: Sequence[Any], settings: Settings) -> Path:
     """A folder that depends on all that a study's maps and results depend on."""
     everything = (
@@ -131,6 +148,7 @@ def study_folder(work: Path, name: str, depends: Sequence[Any], settings: Settin
         to_dict(settings),
         matcher_hash(settings.localiser.matcher),
         METHOD_VERSION,
+        _STUDY_VERSION,
         __version__,
     )
     plain = "".join(c if c.isalnum() or c in "-_@" else "-" for c in name)

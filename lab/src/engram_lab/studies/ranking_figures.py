@@ -33,7 +33,8 @@ POLICY_COLOURS = {
     "recall": "black",
 }
 _LOOKS = {policy: (colour, "-") for policy, colour in POLICY_COLOURS.items()} | {
-    Configuration("path-near", paths=PathKinds.MATCHED).label: (POLICY_COLOURS["path-near"], "--")
+    Configuration("path-near", paths=kinds).label: (POLICY_COLOURS["path-near"], "--")
+    for kinds in PathKinds
 }
 
 
@@ -54,6 +55,7 @@ def draw_figures(out: Path, campaigns: Sequence[CampaignResult], rows: Sequence[
 
     few = ", ".join(sorted(set(map(_budget, campaigns))))
     rounds = ", ".join(sorted({f"Nr = {one.rounds}" for one in campaigns}))
+    memory = ", ".join(sorted({f"T = {one.T}" for one in campaigns}))
     sizes = [_map_size(one, own[one.name]) for one in campaigns]
     draw("fig09_map_size.png", sizes, f"failure as the map grows, {few}")
     draw("fig10_candidates.png", list(map(_lap, campaigns)), "candidates along an ordinary lap")
@@ -63,15 +65,15 @@ def draw_figures(out: Path, campaigns: Sequence[CampaignResult], rows: Sequence[
         ("lanes_against_distance", "minus_distance", "route not localised less distance's, points"),
     ):
         panels = [_lanes(one, own[one.name], column, label) for one in campaigns]
-        title = f"failure against the number of lanes, {rounds}, T = 10"
+        title = f"failure against the number of lanes, {rounds}, {memory}"
         draw(f"fig11_{name}.png", panels, title)
     for estimator, scaled in (*((one, False) for one in Estimator), (Estimator.LOST, True)):
         name = f"fig12_curves_{estimator.value}{'_scaled' if scaled else ''}.png"
         panels = [_curves(c, twice, estimator, scaled) for twice in (1, 2) for c in campaigns]
         formula = FORMULAS[estimator] + (" · share of route not localised" if scaled else "")
         draw(name, panels, f"failure curves, {rounds}; P(X ≥ x) = {formula}")
-    memory = [_sensitivity(one, own[one.name]) for one in campaigns]
-    draw("fig13_T.png", memory, f"sensitivity of path-near to T, {few}")
+    swept = [_sensitivity(one, own[one.name]) for one in campaigns]
+    draw("fig13_T.png", swept, f"sensitivity of path-near to T, {few}")
     for one in campaigns:
         written += _draw_costs(out, one, own[one.name])
     return written
@@ -115,9 +117,9 @@ def _lap(campaign: CampaignResult) -> Panel:
 
 def _lanes(campaign: CampaignResult, own: Sequence[Row], column: str, label: str) -> Panel:
     """[L15] Fig. 11: failure against Np; differences are paired."""
-    swept = chosen(own, rounds=campaign.rounds, T=10, radius="search", map_sessions=None)
+    swept = chosen(own, rounds=campaign.rounds, T=campaign.T, radius="search", map_sessions=None)
     if column == "minus_distance":
-        swept = chosen(swept, paths=PathKinds.ALL.value)
+        swept = chosen(swept, paths=campaign.paths.value)
     placed = [{**row, "x": _place(row["lanes"])} for row in swept]
     placed.sort(key=lambda row: row["x"])
     lines = [

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 
 from engram.errors import InputError
+from engram.robot import Settings
 from engram_lab.intervals import Resamples, SessionSums, excess_ratio, ratio
 from engram_lab.studies.configurations import (
     EVERYTHING,
@@ -15,6 +17,8 @@ from engram_lab.studies.configurations import (
     Configuration,
     lanes_text,
 )
+from engram_lab.studies.in_force import VARIED, exceptions, in_words
+from engram_lab.studies.in_force import rows as in_force_rows
 from engram_lab.studies.pages import (
     COMPARED,
     Row,
@@ -42,6 +46,8 @@ from engram_lab.studies.summary import CampaignResult, ConfigurationResult, coll
 # the oracle.
 _NEGLIGIBLE = 0.005
 _BEST_KNOWN = "recall"
+# Tables of the settings that make maps and localise held-out drives.
+_USED = {one.name for one in fields(Settings)} | {"drive"}
 # So many map sizes are shown, evenly over those that there are.
 _SHOWN_SIZES = 8
 _POLICY_COLUMNS = {
@@ -82,6 +88,7 @@ def write_report(out: Path, plans: Sequence[Plan]) -> list[Path]:
         campaigns
     )
     tables = {
+        "in_force": [row for one in campaigns for row in _in_force_rows(one)],
         "summary": rows,
         "sessions": [row for one in campaigns for row in session_rows(one)],
         "comparisons": comparisons,
@@ -147,8 +154,9 @@ def _comparisons(campaign: CampaignResult) -> Iterator[Row]:
             campaign.get(policy, UNLIMITED), campaign.get("distance", UNLIMITED), "equal",
         )  # fmt: skip
     yield from pair(
-        "`path-near` with T = 0 against T = 10", campaign.get("path-near", T=0), near, "worse"
-    )
+        f"`path-near` with T = 0 against T = {campaign.T}",
+        campaign.get("path-near", T=0), near, "worse",
+    )  # fmt: skip
     ours = campaign.get(_BEST_KNOWN)
     for other in ("path", "path-near", "distance", "bandit"):
         yield from pair(f"`{_BEST_KNOWN}` against `{other}`", ours, campaign.get(other))
@@ -216,37 +224,66 @@ def _page(
     campaigns: Sequence[CampaignResult], rows: Sequence[Row], comparisons: Sequence[Row]
 ) -> Iterator[str]:
     for campaign in campaigns:
-        own = labelled(campaign, rows)
+        own, beside = labelled(campaign, rows), in_words(campaign.in_force())
         yield from (f"## {campaign.name}", "", *_left_out(campaign), _protocol(campaign), "")
-        yield from table(policy_rows(campaign, own), _POLICY_COLUMNS)
-        yield from table(chosen(comparisons, campaign=campaign.name), COMPARED)
+        yield from _exceptions(campaign)
+        yield from table(policy_rows(campaign, own), _POLICY_COLUMNS, beside)
+        yield from table(chosen(comparisons, campaign=campaign.name), COMPARED, beside)
         for column, title in (
             ("share_not_localised", "Route not localised"),
             ("p_gt_10m", "P(> 10 m)"),
         ):
             swept = [
                 {**row, "label": f"{row['label']}, Nr = {row['rounds']}", column: row[column]}
-                for row in chosen(own, map_sessions=None, T=10, radius="search")
+                for row in chosen(own, map_sessions=None, T=campaign.T, radius="search")
             ]
             plain = [
                 {k: v for k, v in row.items() if not k.endswith(("_low", "_high"))} for row in swept
             ]
             yield from (f"{title} by the number of lanes", "")
-            yield from table(pivot(plain, "label", "lanes", column))
-        yield from _sizes(campaign, own)
+            yield from table(pivot(plain, "label", "lanes", column), beside=beside)
+        yield from _sizes(campaign, own, beside)
         if not campaign.with_truth:
             yield from ("The drives have no truth: no pose errors, no false successes.", "")
     if pooled := chosen(comparisons, campaign="pooled"):
-        yield from ("## All sessions pooled", "", *table(pooled, COMPARED))
+        beside = "\n".join(dict.fromkeys(in_words(one.in_force()) for one in campaigns))
+        yield from ("## All sessions pooled", "", *table(pooled, COMPARED, beside))
+
+
+def _in_force_rows(campaign: CampaignResult) -> Iterator[Row]:
+    """What the maps were made by, and what held-out drives were localised by."""
+    runs = {
+        "maps": campaign.maps_in_force,
+        "held out": campaign.in_force(),
+        "held out, as on a robot": campaign.in_force("live"),
+    }
+    for name, known in runs.items():
+        yield from in_force_rows(known, campaign.tables, {"campaign": campaign.name, "of": name})
+
+
+def _exceptions(campaign: CampaignResult) -> Iterator[str]:
+    """What of the settings does not hold."""
+    drive, maps = campaign.tables.drive, campaign.maps_in_force
+    yield (
+        "- Ranking and budget are varied; those of the settings are "
+        f"`{drive.ranking}`, Np = {drive.lanes}, Nr = {drive.rounds}."
+    )
+    if maps:
+        policy, lanes, rounds = (maps.get(key) for key in VARIED)
+        yield f"- Maps were made with `{policy}`, Np = {lanes}, Nr = {rounds}."
+    for line in exceptions(campaign.in_force(), campaign.tables, _USED):
+        yield f"- {line}"
+    yield ""
 
 
 def _protocol(campaign: CampaignResult) -> str:
     count = max((len(one.sessions) for one in campaign.memo.values()), default=0)
     driven = max((one.driven_m.sum() for one in campaign.memo.values()), default=0.0)
     found_again = "no relocalisation" if campaign.relocaliser is None else campaign.relocaliser
+    budget = f"Np = {lanes_text(campaign.few_lanes)}, Nr = {campaign.rounds}, T = {campaign.T}"
     return (
-        f"Np = {lanes_text(campaign.few_lanes)}, Nr = {campaign.rounds}, T = 10; {count} held-out "
-        f"sessions, {driven / 1e3:.1f} km, unguided, {found_again}; 90 % intervals over sessions"
+        f"{budget}; {count} held-out sessions, {driven / 1e3:.1f} km, unguided, {found_again}; "
+        "90 % intervals over sessions"
     )
 
 
@@ -267,7 +304,7 @@ def _left_out(campaign: CampaignResult) -> list[str]:
     ]
 
 
-def _sizes(campaign: CampaignResult, own: Sequence[Row]) -> Iterator[str]:
+def _sizes(campaign: CampaignResult, own: Sequence[Row], beside: str) -> Iterator[str]:
     """P(> 10 m) in maps of so many sessions; a share of the sizes that there are."""
     grown = rows_by_size(campaign, own)
     sizes = sorted({row["map_sessions"] for row in grown if row["map_sessions"] is not None})
@@ -285,4 +322,4 @@ def _sizes(campaign: CampaignResult, own: Sequence[Row]) -> Iterator[str]:
         if row["map_sessions"] in wanted
     ]
     yield from ("P(> 10 m) as the map grows: sessions in the map (nodes)", "")
-    yield from table(pivot(some, "policy", "map", "p_gt_10m"))
+    yield from table(pivot(some, "policy", "map", "p_gt_10m"), beside=beside)

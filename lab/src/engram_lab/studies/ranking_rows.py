@@ -12,10 +12,10 @@ from engram_lab.intervals import Resamples, beats, difference
 from engram_lab.studies.configurations import (
     UNLIMITED,
     Configuration,
-    PathKinds,
     Radius,
     lanes_text,
 )
+from engram_lab.studies.in_force import columns
 from engram_lab.studies.pages import Row, chosen
 from engram_lab.studies.summary import CampaignResult, ConfigurationResult
 
@@ -66,9 +66,9 @@ def _row(campaign: CampaignResult, mode: str, result: ConfigurationResult, fold:
         "policy": configuration.policy,
         "lanes": configuration.lanes_text,
         "rounds": configuration.rounds,
-        "T": configuration.T,
+        "T": campaign.T_of(configuration),
         "radius": configuration.radius.value,
-        "paths": configuration.paths.value,
+        "paths": (configuration.paths or campaign.paths).value,
         "map_sessions": configuration.sessions,
         "mode": mode,
         "fold": fold,
@@ -93,6 +93,7 @@ def _row(campaign: CampaignResult, mode: str, result: ConfigurationResult, fold:
         "candidates_per_frame": float(np.mean([one.candidates for one in result.sessions])),
         "nodes": float(np.mean([one.nodes for one in result.sessions])),
         "step_ms_without_matching": result.step_ms if mode == "memo" else None,
+        **{name: value for name, value in columns(result.in_force).items() if name != "T"},
     }
 
 
@@ -131,14 +132,17 @@ def few_lanes_results(campaign: CampaignResult) -> list[ConfigurationResult]:
     found += [
         campaign.get(policy, **variant)
         for policy in ("path-near", "path")
-        for variant in ({"radius": Radius.BASIN}, {"paths": PathKinds.MATCHED})
+        for variant in ({"radius": Radius.BASIN}, {"paths": campaign.paths.other})
     ]
     return [one for one in found if one is not None]
 
 
 def labelled(campaign: CampaignResult, rows: Sequence[Row]) -> list[Row]:
     """The memoised rows of all folds, by what is unusual about them."""
-    labels = {(one.policy, one.radius.value, one.paths.value): one.label for one in campaign.memo}
+    labels = {
+        (one.policy, one.radius.value, (one.paths or campaign.paths).value): one.label
+        for one in campaign.memo
+    }
     return [
         {**row, "label": labels[row["policy"], row["radius"], row["paths"]]}
         for row in chosen(rows, campaign=campaign.name, **_USUAL)
@@ -153,7 +157,7 @@ def policy_rows(campaign: CampaignResult, own: Sequence[Row]) -> list[Row]:
     for result in few_lanes_results(campaign):
         one = result.configuration
         (row,) = chosen(
-            own, label=one.label, lanes=one.lanes_text, rounds=one.rounds, T=one.T,
+            own, label=one.label, lanes=one.lanes_text, rounds=one.rounds, T=campaign.T,
             map_sessions=None,
         )  # fmt: skip
         beaten = nearest is not None and result is not nearest
@@ -166,7 +170,7 @@ def policy_rows(campaign: CampaignResult, own: Sequence[Row]) -> list[Row]:
 def rows_by_size(campaign: CampaignResult, own: Sequence[Row]) -> list[Row]:
     """The rows at the few lanes, by the number of sessions in the map ([L15] Fig. 9)."""
     few = chosen(
-        own, lanes=lanes_text(campaign.few_lanes), rounds=campaign.rounds, T=10, radius="search",
-        paths=PathKinds.ALL.value,
+        own, lanes=lanes_text(campaign.few_lanes), rounds=campaign.rounds, T=campaign.T,
+        radius="search", paths=campaign.paths.value,
     )  # fmt: skip
     return sorted(few, key=lambda row: row["map_sessions"] or UNLIMITED)

@@ -33,10 +33,11 @@ from engram_lab.studies.configurations import (
 from engram_lab.studies.drives import DriveSet
 from engram_lab.studies.folds import Fold
 from engram_lab.studies.held_out import localise_held_out
+from engram_lab.studies.in_force import check_logs, check_lost
 from engram_lab.studies.kept_maps import KeptMaps
 from engram_lab.studies.lockstep import Runs
 from engram_lab.studies.memo import MatchMemo
-from engram_lab.studies.plan import StudyOptions, StudyPlan, study_folder
+from engram_lab.studies.plan import StudyOptions, StudyPlan, all_tables, study_folder
 from engram_lab.studies.store import joined, missing, only, read_runs, write_runs
 from engram_lab.studies.tasks import Task
 
@@ -77,6 +78,11 @@ class RankingOptions(StudyOptions):
                 raise ConfigError(f"{name} are {values}, must be whole numbers from 1 on")
 
     @property
+    def swept(self) -> tuple[tuple[str, ...], tuple[int, ...], tuple[int, ...]]:
+        """Policies, Np and Nr."""
+        return self.policies, self.lanes, self.rounds
+
+    @property
     def few_lanes(self) -> int:
         """Np of the figures that show one budget: 2 where that is run."""
         return FEW_LANES if FEW_LANES in self.lanes else self.lanes[0]
@@ -98,15 +104,35 @@ class Plan(StudyPlan[RankingOptions]):
         with_it = "" if self.options.relocaliser is None else f"-{self.options.relocaliser}"
         return self.work / f"{mode}{with_it}-{self.drives.drives[session].key}.npz"
 
+    def live_threads(self) -> int:
+        """Threads of the lanes of a robot that is timed."""
+        threads = self.tables.drive.threads
+        return RobotOptions(lanes=self.options.few_lanes, threads=threads).lane_threads()
+
 
 def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, work: Path) -> Plan:
     """A plan; its folder below `work` depends on all that its maps and results depend on.
 
     More policies, lanes or relocalisers may be run later, and find there what was done.
+
+    Args:
+        drives: what is evaluated.
+        settings: of the robots, or those of all verbs.
+        options: what is run.
+        work: folder of all studies.
+
+    Raises:
+        ConfigError: a setting cannot be obeyed here: the drives were made by another, or matches
+            are made once for all.
     """
-    settings = settings.for_descriptor(drives.drives[0].descriptor)
+    check_logs(settings, drives)
+    check_lost(settings, options.relocaliser)
+    tables = all_tables(settings, drives.drives[0].descriptor)
+    settings = tables.of_robot()
     depends = (drives.hash, to_dict(options.build), options.folds, options.seed)
-    plan = Plan(drives, settings, options, study_folder(work, drives.name, depends, settings))
+    folder = study_folder(work, drives.name, depends, settings)
+    plan = Plan(drives, settings, options, folder, tables)
+    plan.live_threads()  # refuses too few before anything is run
     plan.begin()
     return plan
 
@@ -171,7 +197,7 @@ def _run_session(plan: Plan, fold: Fold, session: int) -> None:
     path = plan.runs_path(session, "memo")
     done = read_runs(path)
     options = plan.options
-    whole = missing(done, sweep(options.policies, options.lanes, options.rounds))
+    whole = missing(done, sweep(*options.swept, plan.settings.localiser))
     earlier: list[Configuration] = []
     if options.map_sizes:
         wanted = map_sizes(
@@ -215,7 +241,8 @@ def _run_live(plan: Plan, fold: Fold, session: int) -> None:
     frames = plan.drives.drives[session].frames()
     for configuration in wanted:  # one after another: each has the machine for itself
         with open_map(read_built_map(plan.map_path(fold)).path) as opened:
-            runs = _run_in(plan, fold, session, frames, None, opened, [configuration])
+            about = plan, fold, session, frames, None, opened, [configuration]
+            runs = _run_in(*about, threads=plan.live_threads())
             done = joined(done, runs)
     assert done is not None
     write_runs(path, done)
@@ -229,6 +256,7 @@ def _run_in(
     matcher: Matcher | None,
     opened: Map,
     configurations: Sequence[Configuration],
+    threads: int | None = None,
 ) -> Runs:
     """One session in one map."""
     return localise_held_out(
@@ -240,6 +268,7 @@ def _run_in(
         plan.settings,
         matcher,
         plan.options.relocaliser,
+        threads,
     )
 
 

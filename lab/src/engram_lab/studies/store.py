@@ -17,7 +17,7 @@ import numpy as np
 from engram_lab.studies.configurations import Configuration
 from engram_lab.studies.lockstep import Runs
 
-_VERSION = 2
+_VERSION = 3
 # What NumPy, zip and JSON say of damaged files.
 UNREADABLE = (
     OSError,
@@ -31,7 +31,8 @@ UNREADABLE = (
     zipfile.BadZipFile,
     zlib.error,
 )
-_PER_FRAME = [one.name for one in fields(Runs) if one.name not in {"configurations", "step_m"}]
+_LISTS = {"configurations", "in_force"}
+_PER_FRAME = [one.name for one in fields(Runs) if one.name not in _LISTS | {"step_m"}]
 
 
 def read_runs(path: Path) -> Runs | None:
@@ -43,9 +44,13 @@ def read_runs(path: Path) -> Runs | None:
             if int(kept["kind"][0]) != _VERSION:
                 return None
             plain = json.loads(str(kept["configurations"][0]))
+            in_force = json.loads(str(kept["in_force"][0]))
             columns: dict[str, Any] = {name: kept[name] for name in _PER_FRAME}
             return Runs(
-                tuple(Configuration.from_dict(one) for one in plain), kept["step_m"], **columns
+                tuple(Configuration.from_dict(one) for one in plain),
+                kept["step_m"],
+                in_force=tuple(dict(one) for one in in_force),
+                **columns,
             )
     except UNREADABLE:
         return None
@@ -59,6 +64,7 @@ def write_runs(path: Path, runs: Runs) -> None:
         draft,
         kind=np.array([_VERSION]),
         configurations=np.array([json.dumps(plain)]),
+        in_force=np.array([json.dumps(runs.in_force)]),
         step_m=runs.step_m,
         **{name: getattr(runs, name) for name in _PER_FRAME},
     )
@@ -73,14 +79,24 @@ def joined(first: Runs | None, second: Runs) -> Runs:
     columns: dict[str, Any] = {
         name: np.concatenate([getattr(kept, name), getattr(second, name)]) for name in _PER_FRAME
     }
-    return Runs(kept.configurations + second.configurations, second.step_m, **columns)
+    return Runs(
+        kept.configurations + second.configurations,
+        second.step_m,
+        in_force=kept.in_force + second.in_force,
+        **columns,
+    )
 
 
 def only(runs: Runs, wanted: Collection[Configuration]) -> Runs:
     """Some of the configurations, in the order in which they stand."""
     rows = [row for row, one in enumerate(runs.configurations) if one in wanted]
     columns: dict[str, Any] = {name: getattr(runs, name)[rows] for name in _PER_FRAME}
-    return replace(runs, configurations=tuple(runs.configurations[row] for row in rows), **columns)
+    return replace(
+        runs,
+        configurations=tuple(runs.configurations[row] for row in rows),
+        in_force=tuple(runs.in_force[row] for row in rows),
+        **columns,
+    )
 
 
 def missing(runs: Runs | None, wanted: Iterable[Configuration]) -> list[Configuration]:

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.cli.settings import AllSettings
 from engram.errors import InputError
 from engram.measures import Drive, Estimator, failure_sums, longest_gap_m
 from engram_lab.accuracy import PoseErrors
@@ -24,10 +25,12 @@ from engram_lab.studies.building import BuiltMap
 from engram_lab.studies.configurations import (
     EVERYTHING,
     Configuration,
+    PathKinds,
     map_sizes,
     sweep,
 )
 from engram_lab.studies.folds import Fold
+from engram_lab.studies.in_force import VARIED, Values, common
 from engram_lab.studies.lockstep import Runs
 from engram_lab.studies.running import Plan, built_map
 from engram_lab.studies.store import read_runs
@@ -49,6 +52,7 @@ class SessionResult:
         near, near_seen: as in `Runs`, summed over frames.
         errors: of the poses of its successes, where truth is known.
         step_ms: mean time of a frame.
+        in_force: what it was localised by.
     """
 
     session: int
@@ -62,6 +66,7 @@ class SessionResult:
     near_seen: int
     errors: PoseErrors
     step_ms: float
+    in_force: Values
 
     @property
     def frames(self) -> int:
@@ -75,6 +80,11 @@ class ConfigurationResult:
     def __init__(self, configuration: Configuration, sessions: Sequence[SessionResult]) -> None:
         self.configuration = configuration
         self.sessions = tuple(sorted(sessions, key=lambda one: one.session))
+
+    @cached_property
+    def in_force(self) -> Values:
+        """What the sessions were localised by."""
+        return common(one.in_force for one in self.sessions)
 
     @property
     def drives(self) -> list[Drive]:
@@ -158,6 +168,8 @@ class CampaignResult:
             where that was not run.
         left_out: configurations that were not run on the same sessions as most, with on how many;
             they are in no table.
+        tables: the settings that the study was given.
+        maps_in_force: what the maps were made by.
     """
 
     name: str
@@ -170,6 +182,29 @@ class CampaignResult:
     relocaliser: str | None
     lap: Lap | None
     left_out: Mapping[Configuration, int]
+    tables: AllSettings
+    maps_in_force: Values
+
+    @property
+    def T(self) -> int:  # noqa: N802 - the paper's letter
+        """Iterations remembered where a configuration does not say otherwise."""
+        return self.tables.localiser.recent.T
+
+    def T_of(self, configuration: Configuration) -> int:  # noqa: N802 - the paper's letter
+        """Iterations that a configuration asks for."""
+        return self.T if configuration.T is None else configuration.T
+
+    @property
+    def paths(self) -> PathKinds:
+        """Entries that count where a configuration does not say otherwise."""
+        return PathKinds.of(self.tables.localiser)
+
+    def in_force(self, mode: str = "memo") -> Values:
+        """What all configurations without a variant were localised by; each adds its budget."""
+        results = self.memo if mode == "memo" else self.live
+        plain = (one for one in results.values() if one.configuration.is_plain)
+        known = common(one.in_force for one in plain)
+        return {key: value for key, value in known.items() if key not in VARIED}
 
     @cached_property
     def resamples(self) -> Resamples:
@@ -219,15 +254,17 @@ def collect(plan: Plan) -> CampaignResult:
     compares configurations on the same sessions. `CampaignResult.left_out` tells of it.
     """
     options = plan.options
-    wanted = set(sweep(options.policies, options.lanes, options.rounds))
+    wanted = set(sweep(*options.swept, plan.settings.localiser))
     for fold in plan.run_folds:
         wanted.update(
             map_sizes(options.policies, options.few_lanes, len(fold.training), options.rounds[0])
         )
     by_mode: dict[str, _Found] = {"memo": {}, "live": {}}
     laps: list[Lap] = []
+    maps: list[Values] = []
     for fold in plan.run_folds:
         built = built_map(plan, fold)
+        maps.append(built.in_force)
         for session in fold.held_out:
             for mode, found in by_mode.items():
                 runs = read_runs(plan.runs_path(session, mode))
@@ -247,7 +284,7 @@ def collect(plan: Plan) -> CampaignResult:
     live = _on_same(by_mode["live"], lambda sessions, having: (having, len(sessions)))
     # Where folds differ in size, the largest maps of some have no counterpart in the others.
     least = min(len(fold.training) for fold in plan.run_folds)
-    common = [one for one in begun if one.sessions is None or one.sessions < least]
+    comparable = [one for one in begun if one.sessions is None or one.sessions < least]
     return CampaignResult(
         plan.drives.name,
         memo,
@@ -258,7 +295,9 @@ def collect(plan: Plan) -> CampaignResult:
         options.rounds[0],
         options.relocaliser,
         _ordinary(laps),
-        {one: len(begun[one]) for one in common if one not in memo},
+        {one: len(begun[one]) for one in comparable if one not in memo},
+        plan.tables,
+        common(maps),
     )
 
 
@@ -312,6 +351,7 @@ def session_result(runs: Runs, row: int, session: int, fold: int, nodes: int) ->
             runs.turn_rad[row][known].astype(np.float64),
         ),
         step_ms=float(runs.step_ms[row]),
+        in_force=runs.in_force[row],
     )
 
 

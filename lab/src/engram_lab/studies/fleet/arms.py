@@ -2,66 +2,105 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from engram.fleet.merge import NO_RELOCALISER, MergeOptions
+from engram.cli.settings import AllSettings
+from engram.fleet.merge import MergeOptions
 from engram.robot import RobotOptions
 from engram_lab.studies.configurations import UNLIMITED, Configuration
 
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """One policy and budget for everything: mapping, the replay of merges, held-out drives.
+    """One way to do everything.
 
     Attributes:
         letter: key in `ARMS`.
-        policy: key of `POLICIES`.
-        lanes, rounds: Np and Nr; counts only, so that the same input gives the same maps.
         words: for tables and legends.
-        sure_inliers: of `MergeOptions`.
+        driving: how drives are mapped, localised as on a robot, and judge orders of merging.
+        merging: how maps are merged.
     """
 
     letter: str
-    policy: str
-    lanes: int
-    rounds: int
     words: str
-    sure_inliers: int = MergeOptions().sure_inliers
-
-    def mapping(self, relocaliser: str | None) -> RobotOptions:
-        """How drives are mapped."""
-        return RobotOptions(self.policy, self.lanes, self.rounds, relocaliser=relocaliser)
-
-    def merging(self, relocaliser: str | None) -> MergeOptions:
-        """How maps are merged."""
-        return MergeOptions(
-            self.policy,
-            self.lanes,
-            self.rounds,
-            relocaliser or NO_RELOCALISER,
-            sure_inliers=self.sure_inliers,
-        )
-
-    def localising(self, relocaliser: str | None) -> RobotOptions:
-        """How drives are localised as on a robot."""
-        return RobotOptions(self.policy, self.lanes, self.rounds, relocaliser=relocaliser)
-
-    def judging(self, relocaliser: str | None) -> RobotOptions:
-        """How orders of merging are judged."""
-        return RobotOptions(self.policy, self.lanes, self.rounds, relocaliser=relocaliser)
+    driving: RobotOptions
+    merging: MergeOptions
 
     @property
     def configuration(self) -> Configuration:
         """How held-out drives are localised."""
-        return Configuration(self.policy, self.lanes, self.rounds)
+        return Configuration(self.driving.policy, self.driving.lanes, self.driving.rounds)
 
 
+@dataclass(frozen=True, slots=True)
+class ArmRule:
+    """What an arm sets; all else is as the settings say.
+
+    Attributes:
+        words: for tables and legends.
+        policy: key of `POLICIES`, for driving and merging; None for those of the settings.
+        lanes, rounds: Np and Nr of both, with the policy; counts only, so that the same input
+            gives the same maps.
+        sure_inliers: of `MergeSettings`; None for those of the settings.
+    """
+
+    words: str
+    policy: str | None = None
+    lanes: int = 0
+    rounds: int = 0
+    sure_inliers: int | None = None
+
+    def under(self, settings: AllSettings, letter: str, relocaliser: str | None) -> Arm:
+        """The arm under some settings.
+
+        Args:
+            settings: the tables `drive` and `merge` say what the arm leaves open.
+            letter: key in `ARMS`.
+            relocaliser: key of `RELOCALISERS`, for robots; None for none.
+        """
+        drive, merging = settings.drive, MergeOptions.of(settings.merge)
+        driving = RobotOptions(
+            drive.ranking,
+            drive.lanes,
+            drive.rounds,
+            relocaliser=relocaliser,
+            threads=drive.threads,
+        )
+        if self.policy is not None:
+            policy, lanes, rounds = self.policy, self.lanes, self.rounds
+            driving = replace(driving, policy=policy, lanes=lanes, rounds=rounds)
+            merging = replace(merging, ranking=policy, lanes=lanes, rounds=rounds)
+        if self.sure_inliers is not None:
+            merging = replace(merging, sure_inliers=self.sure_inliers)
+        return Arm(letter, self.words, driving, merging)
+
+
+# What is run unless told.
+USUAL_ARMS = ("A", "B", "C")
+AS_SET = "S"
 ARMS = {
-    # [G16] §III-A: breadth first in the neighbourhood, nearest first, under a budget.
-    "A": Arm("A", "distance", 2, 4, "distance, 8 attempts"),
-    "B": Arm("B", "recall", 2, 4, "recall, 8 attempts"),
+    "A": ArmRule("distance, 8 attempts", "distance", 2, 4),
+    "B": ArmRule("recall, 8 attempts", "recall", 2, 4),
     # All candidates, one after another, until one is believed.
-    "C": Arm("C", "distance", 1, UNLIMITED, "exhaustive"),
-    # A as it was in the paper: whatever matches is omitted, also what other drives rely on.
-    "P": Arm("P", "distance", 2, 4, "as A, every match omits", sure_inliers=0),
+    "C": ArmRule("exhaustive", "distance", 1, UNLIMITED),
+    # Whatever matches is omitted, also what other drives rely on, as in [G16] §V-A.
+    "P": ArmRule("as A, every match omits", "distance", 2, 4, sure_inliers=0),
+    # The papers', with their settings.
+    AS_SET: ArmRule("as the settings say"),
 }
+# What arms other than `AS_SET` set themselves.
+_SET_BY_ARMS = (
+    ("drive", ("ranking", "lanes", "rounds")),
+    ("merge", ("ranking", "lanes", "rounds", "sure_inliers")),
+)
+
+
+def arms_for(settings: AllSettings) -> tuple[str, ...]:
+    """The arms to run unless told: that of the settings where they set what arms would."""
+    usual = AllSettings()
+    changed = any(
+        getattr(getattr(settings, table), name) != getattr(getattr(usual, table), name)
+        for table, names in _SET_BY_ARMS
+        for name in names
+    )
+    return (AS_SET,) if changed else USUAL_ARMS

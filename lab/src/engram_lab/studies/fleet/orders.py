@@ -57,18 +57,19 @@ def try_orders(plan: FleetPlan, arm: Arm, fold: Fold, names: Sequence[str]) -> N
     path = folder / "orders.json"
     if path.exists():
         return
-    relocaliser = plan.options.relocaliser
     judge = JudgeOptions(
         [one.path for one in plan.validation(fold)],
-        localising=arm.judging(relocaliser),
+        judge_at_m=plan.tables.build.max_gap_m,
+        localising=arm.driving,
         reported=[one.path for one in plan.held_out(fold)],
         localise=_Judge(plan, arm, fold),
+        estimator=plan.tables.build.estimator,
     )
     found = find_best_order(
         [map_path(plan, arm, fold, name) for name in names],
         folder / "orders",
         plan.settings,
-        arm.merging(relocaliser),
+        arm.merging,
         judge,
         QUIET,
     )

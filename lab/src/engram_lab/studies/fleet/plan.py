@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from engram.cli.settings import AllSettings
 from engram.config import to_dict
 from engram.errors import ConfigError
+from engram.fleet.merge import NO_RELOCALISER
 from engram.robot import Settings
 from engram_lab.studies.drives import DriveSet, EvaluatedDrive
-from engram_lab.studies.fleet.arms import ARMS, Arm
+from engram_lab.studies.fleet.arms import ARMS, USUAL_ARMS, Arm
 from engram_lab.studies.folds import Fold
-from engram_lab.studies.plan import StudyOptions, StudyPlan, study_folder
+from engram_lab.studies.in_force import check_logs, check_lost
+from engram_lab.studies.plan import StudyOptions, StudyPlan, all_tables, study_folder
 
 EXPERIMENTS = (7, 8, 9, 10)
 # Raise it whenever maps are merged otherwise, or more is recorded of maps and merges: studies of
@@ -25,6 +28,8 @@ _MERGING_VERSION = 4
 _FORAY_LOGS = 7
 _ORDER_GROUP_LOGS = 9
 ROBOTS = ("r1", "r2")
+# Tables of the settings that the study reads, beside the robots'.
+VERBS = ("drive", "merge", "build", "download")
 # What the robots download between their forays ([G16] Fig. 9).
 FORAY_POLICIES = ("copy", "tod", "tod+paths")
 
@@ -40,10 +45,11 @@ class FleetOptions(StudyOptions):
         more_groups: further k, on the first fold, to see how far more of them go.
         order_groups: how many groups are merged in all orders. 4: [G16] §VI-E.
         tried: held-out drives of each fold that downloads are tried out on; None for all.
-        relocaliser: as of every study, but by default lost robots are found.
+        relocaliser: of robots, as of every study, but by default the lost are found. Merges have
+            that of the settings, where these tell of merging.
     """
 
-    arms: tuple[str, ...] = ("A", "B", "C")
+    arms: tuple[str, ...] = USUAL_ARMS
     experiments: tuple[int, ...] = EXPERIMENTS
     groups: int = 4
     more_groups: tuple[int, ...] = (2, 8)
@@ -111,7 +117,8 @@ class FleetPlan(StudyPlan[FleetOptions]):
     @property
     def arms(self) -> tuple[Arm, ...]:
         """Those asked for."""
-        return tuple(ARMS[one] for one in self.options.arms)
+        relocaliser = self.options.relocaliser
+        return tuple(ARMS[one].under(self.tables, one, relocaliser) for one in self.options.arms)
 
     def folder(self, arm: Arm, fold: Fold) -> Path:
         """Where one arm's maps and results of one fold lie."""
@@ -169,13 +176,35 @@ def make_fleet_plan(
 
     More arms or experiments may be run later, and find there what was done.
 
+    Args:
+        drives: what is evaluated.
+        settings: of all verbs; those of robots alone leave the others' tables as they are.
+        options: what is run.
+        work: folder of all studies.
+
     Raises:
-        ConfigError: too few drives for the protocols.
+        ConfigError: too few drives for the protocols, or a setting cannot be obeyed here: the
+            drives were made by another, or matches are made once for all.
     """
-    settings = settings.for_descriptor(drives.drives[0].descriptor)
-    depends = (drives.hash, options.folds, options.seed, options.relocaliser, _MERGING_VERSION)
+    check_logs(settings, drives)
+    check_lost(settings, options.relocaliser)
+    tables = all_tables(settings, drives.drives[0].descriptor)
+    if not isinstance(settings, AllSettings):
+        merging = replace(tables.merge, relocaliser=options.relocaliser or NO_RELOCALISER)
+        tables = replace(tables, merge=merging)
+    settings = tables.of_robot()
+    depends = (
+        drives.hash,
+        options.folds,
+        options.seed,
+        options.relocaliser,
+        _MERGING_VERSION,
+        *(to_dict(getattr(tables, name)) for name in VERBS),
+    )
     folder = study_folder(work, f"fleet-{drives.name}", depends, settings)
-    plan = FleetPlan(drives, settings, options, folder)
+    plan = FleetPlan(drives, settings, options, folder, tables)
+    for arm in plan.arms:
+        arm.driving.lane_threads(maps=True)  # refuses too few before anything is run
     for fold in plan.folds:
         plan.protocol(fold)  # raises where there are too few
     plan.begin()

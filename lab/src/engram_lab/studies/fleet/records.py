@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from engram.config import to_dict
 from engram.measures import Drive
 from engram_lab.studies.building import write_json
+from engram_lab.studies.in_force import Values
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +28,7 @@ class MergeRecord:
         attempts, proposed, lookups: match attempts, those of them at proposed nodes, and nodes for
             which the relocaliser was asked.
         seconds: wall time.
+        in_force: what the centre keeps of how it was made.
     """
 
     name: str
@@ -39,6 +41,7 @@ class MergeRecord:
     proposed: int
     lookups: int
     seconds: float
+    in_force: Values = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +55,7 @@ class DownloadRecord:
         nodes, of_nodes: sent, and of the centre.
         united: sent, together with what the robot itself had saved and the centre knows.
         size_bytes, of_bytes: of the file, and of the centre's.
+        in_force: what the file keeps of how it was made.
     """
 
     policy: str
@@ -61,6 +65,7 @@ class DownloadRecord:
     united: int
     size_bytes: int
     of_bytes: int
+    in_force: Values = field(default_factory=dict)
 
 
 def write_record(path: Path, record: Any) -> None:

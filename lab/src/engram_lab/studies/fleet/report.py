@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 
+from engram.robot import Settings
 from engram_lab.studies.fleet.comparisons import comparison_rows
 from engram_lab.studies.fleet.figures import draw_fleet_figures
-from engram_lab.studies.fleet.plan import FleetPlan
+from engram_lab.studies.fleet.plan import VERBS, FleetPlan
 from engram_lab.studies.fleet.records import read_json
 from engram_lab.studies.fleet.results import ArmResult
 from engram_lab.studies.fleet.stages import stages_path
 from engram_lab.studies.fleet.tables import fleet_rows, order_rows, session_rows
+from engram_lab.studies.in_force import common, exceptions, in_words
+from engram_lab.studies.in_force import rows as in_force_rows
 from engram_lab.studies.pages import COMPARED, Row, chosen, make_folder, table, write_study
 
 _TITLES = {
@@ -20,6 +24,29 @@ _TITLES = {
     9: "Taking a part (Fig. 9)",
     10: "Orders of merging (Fig. 10)",
 }
+# What stands beside every table, of each kind of step.
+_BUDGET = {"drive.ranking": "policy", "drive.lanes": "Np", "drive.rounds": "Nr"}
+_SHOWN = {
+    "maps": {**_BUDGET, "mapper.sure_inliers": "sure inliers"},
+    "merges": {
+        "merge.ranking": "policy",
+        "merge.lanes": "Np",
+        "merge.rounds": "Nr",
+        "merge.relocaliser": "relocaliser",
+        "merge.sure_inliers": "sure inliers",
+        "merge.unit": "unit",
+        "merge.seed": "seed",
+    },
+    "held out": _BUDGET,
+    "downloads": {
+        "download.window_min": "window min",
+        "download.epoch_min": "epoch min",
+        "download.best_percent": "best %",
+    },
+    "orders": {"build.max_gap_m": "judged at m", "build.estimator": "over"},
+}
+# Tables of the settings that the study reads.
+_USED = {one.name for one in fields(Settings)} | set(VERBS)
 _COLUMNS = {
     "arm": "arm",
     "map": "map",
@@ -52,6 +79,7 @@ def write_fleet_report(out: Path, plans: Sequence[FleetPlan]) -> list[Path]:
     arms = [ArmResult(plan, arm) for plan in plans for arm in plan.arms]
     make_folder(out)
     tables = {
+        "in_force": [row for arm in arms for row in _in_force_rows(arm)],
         "summary": [row for arm in arms for row in fleet_rows(arm)],
         "sessions": [row for arm in arms for row in session_rows(arm)],
         "orders": [row for arm in arms for row in order_rows(arm)],
@@ -73,6 +101,8 @@ def _page(
         own = [arm for arm in arms if arm.plan.drives.name == name]
         yield from (f"## {name}", "", _protocol(own[0]), "")
         yield from (_medians(arm) for arm in own if arm.stages is not None)
+        yield from (f"- Arm {arm.arm.letter}: {line}" for arm in own for line in _exceptions(arm))
+        beside = "\n".join(line for arm in own if (line := _in_words(arm)))
         for number, title in _TITLES.items():
             # The orders are tried on one fold; all else is pooled.
             fold = "0" if number == 10 else "all"
@@ -85,8 +115,33 @@ def _page(
                     for key, words in _COLUMNS.items()
                     if any(row.get(key) is not None for row in shown)
                 }
-                yield from table(shown, columns)
-                yield from table(claims, {"arm": "arm", **COMPARED, "drives": "drives"})
+                yield from table(shown, columns, beside)
+                yield from table(claims, {"arm": "arm", **COMPARED, "drives": "drives"}, beside)
+
+
+def _in_force_rows(arm: ArmResult) -> Iterator[Row]:
+    """What each kind of step of an arm ran by."""
+    for name, known in arm.in_force().items():
+        about = {"campaign": arm.plan.drives.name, "arm": arm.arm.letter, "of": name}
+        yield from in_force_rows(known, arm.plan.tables, about)
+
+
+def _exceptions(arm: ArmResult) -> Iterator[str]:
+    """What of the settings does not hold in an arm."""
+    known = common(arm.in_force().values())
+    yield from exceptions(known, arm.plan.tables, _USED)
+
+
+def _in_words(arm: ArmResult) -> str:
+    """What is in force in an arm, beside its rows; empty where nothing was run."""
+    known = arm.in_force()
+    parts = [in_words(known.get("held out", {}))]
+    for name, keys in _SHOWN.items():
+        some = known.get(name, {})
+        told = ", ".join(f"{words} {some[key]}" for key, words in keys.items() if key in some)
+        parts += [f"{name.capitalize()}: {told}."] if told else []
+    told = " ".join(filter(None, parts))
+    return f"- Arm {arm.arm.letter}. {told}" if told else ""
 
 
 def _protocol(arm: ArmResult) -> str:

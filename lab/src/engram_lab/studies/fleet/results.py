@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from engram.measures import Drive
@@ -21,12 +22,14 @@ from engram_lab.studies.fleet.records import (
     MergeRecord,
     read_download,
     read_drive,
+    read_json,
     read_merge,
 )
 from engram_lab.studies.fleet.stages import Counts, StageTimes, read_stages
 from engram_lab.studies.fleet.steps import field_path, map_path, runs_path
 from engram_lab.studies.fleet.trials import TriedDownload, read_trials
 from engram_lab.studies.folds import Fold
+from engram_lab.studies.in_force import Values, common
 from engram_lab.studies.store import read_runs
 from engram_lab.studies.summary import ConfigurationResult, SessionResult, session_result
 
@@ -262,6 +265,43 @@ class FoldResult:
         """Seconds of so many; None if no medians were measured."""
         return None if self._stages is None else self._stages.seconds(counts)
 
+    # -- what each kind of step ran by
+
+    def maps_in_force(self) -> Iterator[Values]:
+        """Of each map that drives were added to."""
+        for path in self._folder.glob("*.json"):
+            known = read_json(path)
+            if "sessions" in known and known.get("in_force"):
+                yield known["in_force"]
+
+    def merges_in_force(self) -> Iterator[Values]:
+        """Of each merge."""
+        for path in self._folder.glob("*.merge.json"):
+            yield MergeRecord(**read_json(path)).in_force
+
+    def downloads_in_force(self) -> Iterator[Values]:
+        """Of each download, for a foray or a held-out drive."""
+        for path in self._folder.glob("*.download.json"):
+            yield DownloadRecord(**read_json(path)).in_force
+        for one in chain.from_iterable(self.trials().values()):
+            yield one[1].in_force
+
+    def drives_in_force(self) -> Iterator[Values]:
+        """Of each held-out drive in each map."""
+        for path in self._folder.glob("runs-*.npz"):
+            runs = read_runs(path)
+            yield from () if runs is None else runs.in_force
+
+    def orders_in_force(self) -> Iterator[Values]:
+        """Of the orders of merging."""
+        found = self.orders()
+        if found is not None:
+            yield {"build.max_gap_m": found["judge_at_m"], "build.estimator": found["estimator"]}
+
+    @property
+    def _folder(self) -> Path:
+        return self.plan.folder(self.arm, self.fold)
+
     def _beside(self, name: str, kind: str) -> Any:
         return map_path(self.plan, self.arm, self.fold, name).with_suffix(f".{kind}.json")
 
@@ -294,6 +334,17 @@ class ArmResult:
         if not found[0]:
             return None
         return [ConfigurationResult(self.configuration, one) for one in found]
+
+    def in_force(self) -> dict[str, Values]:
+        """What each kind of step ran by, of those that were made."""
+        found = {
+            "maps": [one for fold in self.folds for one in fold.maps_in_force()],
+            "merges": [one for fold in self.folds for one in fold.merges_in_force()],
+            "downloads": [one for fold in self.folds for one in fold.downloads_in_force()],
+            "held out": [one for fold in self.folds for one in fold.drives_in_force()],
+            "orders": [one for fold in self.folds for one in fold.orders_in_force()],
+        }
+        return {name: common(some) for name, some in found.items() if some}
 
     def forays(self, policy: str) -> list[InField]:
         """All drives of all second forays in one kind of download, of the folds that have all."""

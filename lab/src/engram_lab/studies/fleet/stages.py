@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -103,9 +103,8 @@ def measure_stages(plan: FleetPlan, arm: Arm, fold: Fold, name: str) -> None:
     path = stages_path(plan, arm)
     if path.exists():
         return
-    options = RobotOptions(
-        arm.policy, 1, min(arm.rounds * arm.lanes, _ROUNDS), relocaliser=plan.options.relocaliser
-    )
+    rounds = min(arm.driving.budget.attempts, _ROUNDS)
+    options = replace(arm.driving, lanes=1, rounds=rounds, threads=None)
     drives, centre = plan.held_out(fold), map_path(plan, arm, fold, name)
     chosen = [one.path for one in drives[:: max(len(drives) // _DRIVES, 1)][:_DRIVES]]
     passes = [medians(chosen, centre, plan.settings, options) for _ in range(_PASSES)]

@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from engram.cli.settings import DownloadSettings
 from engram.errors import InputError
-from engram.fleet.download import DownloadOptions, DownloadReport, download
+from engram.fleet.download import DownloadReport, download
 from engram.fleet.merge import merge as merge_maps
 from engram.graph.clock import hour_of_day
 from engram.graph.model import path_id
 from engram.maps import Map, copy_map
 from engram.robot import MapReport, measured
-from engram_lab.studies.building import build_map
+from engram_lab.studies.building import build_map, newest_in_force
 from engram_lab.studies.drives import EvaluatedDrive
 from engram_lab.studies.fleet.arms import Arm
 from engram_lab.studies.fleet.plan import FleetPlan
@@ -87,7 +88,7 @@ def map_drives(
         path,
         drives,
         plan.settings,
-        arm.mapping(plan.options.relocaliser),
+        arm.driving,
         base=None if base is None else map_path(plan, arm, fold, base),
         known=plan.training(fold),
         look_at=look_at,
@@ -105,7 +106,7 @@ def merge(plan: FleetPlan, arm: Arm, fold: Fold, name: str, centre: str, robot: 
     (report,) = merge_maps(
         draft,
         [map_path(plan, arm, fold, robot)],
-        arm.merging(plan.options.relocaliser),
+        arm.merging,
         settings=plan.settings,
     )
     if report.interrupted:
@@ -123,6 +124,7 @@ def merge(plan: FleetPlan, arm: Arm, fold: Fold, name: str, centre: str, robot: 
         proposed=report.proposed_attempts,
         lookups=report.lookups,
         seconds=report.seconds,
+        in_force=newest_in_force(draft),
     )
     write_record(record, made)
     draft.replace(path)
@@ -158,7 +160,8 @@ def download_for_foray(
     hour = hour_of_day(session, session.start_ns)
     whole = map_path(plan, arm, fold, centre)
     draft = _draft(path)
-    report = _downloaded(whole, draft, policy if hour is not None else "copy", hour)
+    asked = plan.tables.download
+    report = _downloaded(whole, draft, asked, policy if hour is not None else "copy", hour)
     paths = {path_id(one.session.id) for one in own}
     with Map.open(whole) as store:
         mine = {node.id for node in store.load().nodes if path_id(node.session) in paths}
@@ -166,21 +169,24 @@ def download_for_foray(
         sent = {node.id for node in store.load().nodes}
     made = DownloadRecord(
         report.policy, hour, report.nodes, report.of_nodes, len(mine | sent), report.size_bytes,
-        report.of_bytes,
+        report.of_bytes, newest_in_force(draft),
     )  # fmt: skip
     write_record(record, made)
     draft.replace(path)
 
 
-def _downloaded(whole: Path, draft: Path, policy: str, hour: float | None) -> DownloadReport:
+def _downloaded(
+    whole: Path, draft: Path, asked: DownloadSettings, policy: str, hour: float | None
+) -> DownloadReport:
     """What a robot gets: where nothing was driven at such an hour it asks for more."""
     try:
-        options = DownloadOptions(policy, start_h=hour, end_h=hour, strict=policy in _ASKS_FOR_MORE)
+        strict = policy in _ASKS_FOR_MORE
+        options = asked.options(policy, start_h=hour, end_h=hour, strict=strict)
         return download(whole, draft, options)
     except InputError:
         if policy not in _ASKS_FOR_MORE:
             raise
-        return _downloaded(whole, draft, _ASKS_FOR_MORE[policy], hour)
+        return _downloaded(whole, draft, asked, _ASKS_FOR_MORE[policy], hour)
 
 
 def localise_in(

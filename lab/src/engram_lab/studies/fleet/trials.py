@@ -7,7 +7,7 @@ the others do, and thumbnails are a tenth of a map.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from engram.errors import InputError
-from engram.fleet.download import DownloadOptions
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, SessionId
 from engram.localiser import Position
@@ -29,6 +28,7 @@ from engram_lab.studies.fleet.plan import FleetPlan
 from engram_lab.studies.fleet.records import read_json
 from engram_lab.studies.fleet.steps import map_path
 from engram_lab.studies.folds import Fold
+from engram_lab.studies.in_force import Values, of_revision
 from engram_lab.trial import Trial, try_downloads
 
 COPY = "copy"
@@ -55,6 +55,7 @@ class TriedDownload:
         ms: mean time of localising a frame.
         lookup_ms: of that, asking the relocaliser.
         lookups: frames for which it was asked.
+        in_force: the settings that it was chosen by.
     """
 
     name: str
@@ -67,6 +68,7 @@ class TriedDownload:
     ms: float
     lookup_ms: float
     lookups: int
+    in_force: Values = field(default_factory=dict)
 
 
 def trials_path(plan: FleetPlan, arm: Arm, fold: Fold, drive: EvaluatedDrive) -> Path:
@@ -87,14 +89,15 @@ def try_downloads_for(
         centre,
         drives=[lambda: FrameLog(drive.path)],
         settings=plan.settings,
-        localise=arm.localising(plan.options.relocaliser),
+        localise=arm.driving,
         start=partial(_start, plan, fold, drive),
     )
-    found, refused = trials({COPY: _wanted(COPY)}), {}
+    wanted = partial(plan.tables.download.options, thumbnails=False)
+    found, refused = trials({COPY: wanted(COPY)}), {}
     if hour_of_day(drive.session, drive.session.start_ns) is not None:
         for one in _BY_HOUR:
             try:
-                found += trials({one: _wanted(one)})
+                found += trials({one: wanted(one)})
             except InputError as error:  # nothing was driven at such an hour
                 refused[one] = str(error)
     sizes = {one.name: one.report.size_bytes for one in found}
@@ -106,7 +109,7 @@ def try_downloads_for(
     }
     for one, room in budgets.items():
         try:
-            found += trials({one: _wanted("budget", room)})
+            found += trials({one: wanted("budget", budget_bytes=room)})
         except InputError as error:  # a map so small that a part of it has no room for a node
             refused[one] = str(error)
     own = [
@@ -140,11 +143,6 @@ def read_trials(
         )
         for one in kept
     ]
-
-
-def _wanted(policy: str, budget_bytes: int | None = None) -> DownloadOptions:
-    """As all downloads here are."""
-    return DownloadOptions(policy, budget_bytes=budget_bytes, thumbnails=False)
 
 
 def _kept(path: Path) -> list[dict[str, Any]] | None:
@@ -186,4 +184,5 @@ def _plain(trial: Trial) -> dict[str, Any]:
         "ms": trial.ms_per_frame,
         "lookup_ms": trial.lookup_ms_per_frame,
         "lookups": trial.lookups,
+        "in_force": of_revision({"download": trial.asked}),
     }
