@@ -72,6 +72,7 @@ def relocalise_drive(
     *,
     relocaliser: str = "fabmap",
     budget: Budget | None = None,
+    threads: int | None = None,
     at: int | str | None = None,
     monitor: Monitor = QUIET,
 ) -> list[ColdStart]:
@@ -83,6 +84,7 @@ def relocalise_drive(
         settings: the resolved configuration.
         relocaliser: key of `RELOCALISERS`.
         budget: of each frame: that of a lost robot.
+        threads: most threads that its lanes share; None for one each.
         at: number or tag of the map's revision; None for the newest.
         monitor: hears of each frame, with its status.
 
@@ -94,7 +96,12 @@ def relocalise_drive(
         settings = settings.for_descriptor(opened.descriptor)
         finder = relocaliser_in(opened, relocaliser, settings.frontend.descriptor)
         localiser = localiser_in(
-            opened, sequence.camera, settings, budget=budget, relocaliser=finder
+            opened,
+            sequence.camera,
+            settings,
+            budget=budget,
+            relocaliser=finder,
+            threads=threads,
         )
         with (
             Robot(Front(settings), localiser) as robot,

@@ -31,6 +31,24 @@ def test_every_frame_of_the_mapped_drive_is_found_at_once(engram, street: Path, 
         assert 0 <= frame["new_place"] <= 1
 
 
+def test_lanes_and_threads_are_as_the_settings_say(
+    engram, street: Path, town: Path, tmp_path: Path, monkeypatch
+) -> None:
+    calls = []
+
+    def look(*_, **options):
+        calls.append((options["budget"].lanes, options["threads"]))
+        return []
+
+    monkeypatch.setattr("engram_lab.relocalising.relocalise_drive", look)
+    file = tmp_path / "robot.toml"
+    file.write_text("[drive]\nlanes = 3\nthreads = 4\n")
+    asked = ("lab", "relocalise", town, street)
+    for options in ((), ("--config", file), ("--config", file, "--lanes", 1)):
+        assert engram(*asked, *options).status == 0
+    assert calls == [(2, 2), (3, 2), (1, 1)]
+
+
 def test_an_empty_map_is_a_new_place_everywhere(engram, street: Path, tmp_path: Path) -> None:
     from engram.maps import Map
 

@@ -74,3 +74,26 @@ def test_a_drive_for_whose_hour_there_is_nothing_is_a_row_of_its_own(
     assert left_out["start_h"] == pytest.approx(22.5, abs=0.01)
     assert "no node was saved within 180 minutes of 22:" in left_out["why"]
     assert f"left out {night}, of 22.5 h: no node was saved" in engram(*asked).out
+
+
+def test_downloads_and_the_drive_are_as_the_settings_say(
+    engram, centre: Path, morning: Path, monkeypatch
+) -> None:
+    calls = []
+
+    def look(*arguments, **options):
+        calls.append(arguments)
+        return []
+
+    monkeypatch.setattr("engram_lab.trial.try_downloads", look)
+    values = {"window_min": 170.0, "epoch_min": 50.0, "best_percent": 40.0, "buffer_min": 5.0}
+    values |= {"widen_min": 30.0, "latitude_deg": 51.0, "radius_m": 25.0}
+    given = [f"download.{name}={value}" for name, value in values.items()]
+    given += ["drive.ranking=distance", "drive.lanes=3", "drive.rounds=1", "drive.threads=4"]
+    asked = [word for one in given for word in ("--set", one)]
+    ran = engram("lab", "try", centre, morning, "--select", "tod", "--depart", "9:30", *asked)
+    assert ran.status == 0, ran.err
+    ((_, wanted, _, _, robot, _),) = calls
+    for options in wanted.values():
+        assert {name: getattr(options, name) for name in values} == values
+    assert (robot.policy, robot.lanes, robot.rounds, robot.threads) == ("distance", 3, 1, 4)

@@ -7,7 +7,7 @@
 Every drive of a small town is localised in each map that it is no part of, once by each rule, from
 a true start. Fixes within 1 m and 5° are right. Lost is what the rule of inliers found rightly and
 `confidence` did not, less what only `confidence` found, in points of the frames. `--set` changes a
-setting of the robots that are localised; maps are those of the defaults.
+setting of the robots that are localised, of `localiser` or `gaps`; maps are those of the defaults.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from engram.cli.settings import read_settings
+from engram.errors import ConfigError
 from engram.frontend import BRIEF, DescriptorKind
-from engram.localiser import Rule
+from engram.localiser import LocaliserConfig, Rule
 from engram.monitor import QUIET
 from engram.robot import Settings
 from engram_lab.misplaced import Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
+from engram_lab.studies.in_force import check_used
 from engram_lab.trial_towns import HELD_OUT_TOWNS, all_streets, light_of
 
 
@@ -101,6 +103,23 @@ def figures(rows: Sequence[Compared]) -> Iterator[Figure]:
         yield Figure("  most of one drive", max(row.lost_points for row in some), "points")
 
 
+# Tables of the settings by which a recorded drive is localised.
+_USED = frozenset({"localiser", "gaps"})
+
+
+def live_settings(changes: Sequence[str], kind: DescriptorKind) -> Settings:
+    """Those of the robots that are localised.
+
+    Raises:
+        ConfigError: a change concerns nothing that they do, or the rule, of which each is tried.
+    """
+    given = read_settings(None, changes)
+    check_used(given, _USED, "a robot in a map of the defaults")
+    if given.localiser.acceptance.rule is not LocaliserConfig().acceptance.rule:
+        raise ConfigError("localiser.acceptance.rule: each rule is tried; leave it out")
+    return given.of_robot(kind)
+
+
 def main() -> None:
     """Runs the program."""
     parser = command_line(__doc__)
@@ -109,7 +128,7 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting")
     asked = parser.parse_args()
     settings, rows = Settings().for_descriptor(asked.kind), []
-    live = read_settings(None, asked.set).for_descriptor(asked.kind)
+    live = live_settings(asked.set, asked.kind)
     for row in compared(asked.towns, settings, live):
         rows.append(row)
         counts = ", ".join(f"{rule.value} {len(row.right[rule])}" for rule in Rule)

@@ -53,15 +53,19 @@ def relocalise(
     from engram.cli.progress import Bars
     from engram.cli.settings import read_settings
     from engram.localiser import Budget
+    from engram.robot import RobotOptions
     from engram_lab.relocalising import relocalise_drive, summarise_cold_starts
 
     sequence, given = drive.open(path), read_settings(config)
+    lanes = lanes or given.drive.lanes
+    robot = RobotOptions(lanes=lanes, threads=given.drive.threads)
     starts = relocalise_drive(
         map_path,
         sequence,
         given.of_robot(),
         relocaliser=relocaliser,
-        budget=Budget(lanes or given.drive.lanes, lost_rounds=rounds),
+        budget=Budget(lanes, lost_rounds=rounds),
+        threads=robot.lane_threads(),
         at=at,
         monitor=Bars(),
     )

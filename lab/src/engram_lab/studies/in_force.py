@@ -65,7 +65,7 @@ def of_localiser(
         matcher: what makes its matches; None for the localiser itself.
     """
     found = {**_of(localiser.in_force), **by_key(gaps.config, "gaps")}
-    if matcher is not None:
+    if matcher is not None and localiser.relocaliser is not None:
         whole = localiser.config.matcher
         found |= {key: getattr(whole, name) for key, name in _BOUNDS_OF_THE_LOST.items()}
     return {
@@ -147,26 +147,27 @@ def rows(known: Mapping[str, Any], settings: AllSettings, about: Mapping[str, An
     ]
 
 
-def exceptions(
-    known: Mapping[str, Any], settings: AllSettings, used: Collection[str]
-) -> Iterator[str]:
-    """What of the settings is not in force, for people: all that a study keeps to itself.
+def exceptions(known: Mapping[str, Any], settings: AllSettings) -> Iterator[str]:
+    """What of the settings is not in force, for people.
 
     Args:
         known: what is in force.
         settings: what the study was given.
-        used: the tables that the study reads.
     """
     other = differing(known, settings)
     varied = [f"`{key} = {other[key][1]}`" for key in VARIED if key in other]
     if varied:
-        yield f"Varied by the study itself: {', '.join(varied)} of the settings."
+        yield f"varied by the study itself: {', '.join(varied)} of the settings"
     rest = {key: values for key, values in other.items() if key not in VARIED}
     if rest:
         changed = ", ".join(f"`{key} = {have}` ({said})" for key, (have, said) in rest.items())
-        yield f"Set by the study itself, the settings' value in brackets: {changed}."
-    if unused := changed_tables(settings, used):
-        yield f"Not used by this study: {', '.join(f'`[{one}]`' for one in unused)}."
+        yield f"set by the study itself, the settings' value in brackets: {changed}"
+
+
+def unused(settings: AllSettings, used: Collection[str]) -> Iterator[str]:
+    """Tables that were changed and that a study does not read, for people."""
+    if changed := changed_tables(settings, used):
+        yield f"- Not used by this study: {', '.join(f'`[{one}]`' for one in changed)}."
 
 
 def changed_tables(settings: AllSettings, used: Collection[str]) -> list[str]:
@@ -222,6 +223,25 @@ def check_lost(settings: Settings, relocaliser: str | None) -> None:
                 "matches each pair once, whether lost or not, with all of localiser.matcher: "
                 "leave it out"
             )
+
+
+def check_used(settings: AllSettings, used: Collection[str], by: str) -> None:
+    """Refuses settings of tables that nothing reads.
+
+    Args:
+        settings: what was given.
+        used: the tables that are read.
+        by: what reads them, for people.
+
+    Raises:
+        ConfigError: another table departs from the defaults; names the setting.
+    """
+    for table in changed_tables(settings, used):
+        changed = differing(by_key(getattr(settings, table), table), AllSettings())
+        key, (value, _) = next(iter(changed.items()))
+        raise ConfigError(
+            f"{key} is {value}, but {by} has no use for it; it reads {', '.join(sorted(used))}"
+        )
 
 
 def differing(in_force: Mapping[str, Any], settings: Settings) -> dict[str, tuple[Any, Any]]:

@@ -17,7 +17,7 @@ from engram_lab.studies.configurations import (
     Configuration,
     lanes_text,
 )
-from engram_lab.studies.in_force import VARIED, exceptions, in_words
+from engram_lab.studies.in_force import VARIED, exceptions, in_words, unused
 from engram_lab.studies.in_force import rows as in_force_rows
 from engram_lab.studies.pages import (
     COMPARED,
@@ -271,8 +271,9 @@ def _exceptions(campaign: CampaignResult) -> Iterator[str]:
     if maps:
         policy, lanes, rounds = (maps.get(key) for key in VARIED)
         yield f"- Maps were made with `{policy}`, Np = {lanes}, Nr = {rounds}."
-    for line in exceptions(campaign.in_force(), campaign.tables, _USED):
-        yield f"- {line}"
+    for line in exceptions(campaign.in_force(), campaign.tables):
+        yield f"- Held-out drives, {line}."
+    yield from unused(campaign.tables, _USED)
     yield ""
 
 

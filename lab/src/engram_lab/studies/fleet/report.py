@@ -14,7 +14,7 @@ from engram_lab.studies.fleet.records import read_json
 from engram_lab.studies.fleet.results import ArmResult
 from engram_lab.studies.fleet.stages import stages_path
 from engram_lab.studies.fleet.tables import fleet_rows, order_rows, session_rows
-from engram_lab.studies.in_force import common, exceptions, in_words
+from engram_lab.studies.in_force import exceptions, in_words, unused
 from engram_lab.studies.in_force import rows as in_force_rows
 from engram_lab.studies.pages import COMPARED, Row, chosen, make_folder, table, write_study
 
@@ -101,7 +101,8 @@ def _page(
         own = [arm for arm in arms if arm.plan.drives.name == name]
         yield from (f"## {name}", "", _protocol(own[0]), "")
         yield from (_medians(arm) for arm in own if arm.stages is not None)
-        yield from (f"- Arm {arm.arm.letter}: {line}" for arm in own for line in _exceptions(arm))
+        yield from (line for arm in own for line in _exceptions(arm))
+        yield from unused(own[0].plan.tables, _USED)
         beside = "\n".join(line for arm in own if (line := _in_words(arm)))
         for number, title in _TITLES.items():
             # The orders are tried on one fold; all else is pooled.
@@ -128,8 +129,9 @@ def _in_force_rows(arm: ArmResult) -> Iterator[Row]:
 
 def _exceptions(arm: ArmResult) -> Iterator[str]:
     """What of the settings does not hold in an arm."""
-    known = common(arm.in_force().values())
-    yield from exceptions(known, arm.plan.tables, _USED)
+    for name, known in arm.in_force().items():
+        for line in exceptions(known, arm.plan.tables):
+            yield f"- Arm {arm.arm.letter}, {name}, {line}."
 
 
 def _in_words(arm: ArmResult) -> str:
