@@ -25,8 +25,9 @@ from engram.doctor import (
 from engram.doctor.checks.motion import scale_off
 from engram.doctor.checks.sides import frames_late, upright
 from engram.doctor.examination import Look
-from engram.doctor.sides import SideMatches, align, match_sides
+from engram.doctor.sides import align
 from engram.frontend import StereoPair
+from engram.frontend.sides import SideMatches, match_sides
 from engram.geometry import SE3, StereoCamera
 from engram.graph.model import Clock
 from engram.odometry import OutsideMotion

@@ -2,24 +2,31 @@
 
 Source: sensor_msgs/CameraInfo. Raw images: x = K·distort(X); `R` rotates the camera to its
 rectified one; `P` = [K' | −fx'·baseline] projects the rectified pair, as seen from the left camera.
+Drivers that calibrate no pair leave `R` and `P` at zero, drivers of rectified images `K`; some
+state +fx'·baseline.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.calibration.cameras import Cameras, rectified_cameras
-from engram.calibration.entries import coefficients, distortion_model, numbers, pixels
+from engram.calibration.entries import lens_of, numbers, pixels
 from engram.errors import CalibrationError
 from engram.geometry import SE3, StereoCamera
 from engram.geometry.rectification import DistortionModel, RawCamera, RawStereoCalibration
 
 # The two projections of a rectified pair share focal length and rows, px.
 _SAME_PX = 1e-3
+# Cameras turned against each other by less, and with their centres this little off a common row, as
+# a share of the baseline, give rows that agree to a tenth of a pixel.
+_PARALLEL_RAD, _LEVEL = 1e-4, 1e-3
+# No robot's cameras are closer, metres.
+_SHORTEST_BASELINE_M = 4e-3
 # K and P of an ideal, rectified camera agree to the digits that drivers print.
 _IDEAL_PX = 1e-2
 
@@ -48,10 +55,32 @@ class CameraInfo:
     frame: str = ""
 
     @property
+    def projects(self) -> bool:
+        """Whether it states the projection of rectified images."""
+        return bool(self.p[0, 0] > 0)
+
+    @property
     def is_ideal(self) -> bool:
         """Whether its raw images are rectified already: no distortion, no rotation, K as in P."""
         same = np.abs(self.k - self.p[:, :3]).max() < _IDEAL_PX
         return not any(self.d) and bool(same) and bool(np.abs(self.r - np.eye(3)).max() < 1e-6)
+
+    def completed(self) -> CameraInfo:
+        """With what drivers leave at zero: an ideal camera's K from P, its P from K, and R.
+
+        Raises:
+            CalibrationError: it is not calibrated.
+        """
+        k, r, p = self.k, self.r, self.p
+        if not (k[0, 0] > 0 or p[0, 0] > 0):
+            raise CalibrationError("is not calibrated: its camera matrix holds only zeros")
+        if not r.any():
+            r = np.eye(3)
+        if not p[0, 0] > 0:
+            p = np.column_stack([k, np.zeros(3)])
+        elif not k[0, 0] > 0:
+            k = p[:, :3]
+        return replace(self, k=k, r=r, p=p)
 
     @property
     def lens(self) -> RawCamera:
@@ -82,8 +111,8 @@ def parse_camera_info(entries: dict[str, Any]) -> CameraInfo:
     Raises:
         CalibrationError: an entry is missing or malformed.
     """
-    model, d = coefficients(
-        distortion_model(entries.get("distortion_model", "plumb_bob")),
+    model, d = lens_of(
+        entries.get("distortion_model", "plumb_bob"),
         lambda counts: numbers(entries, "distortion_coefficients", counts),
     )
     return CameraInfo(
@@ -125,65 +154,129 @@ def cameras_of_infos(
     Raises:
         CalibrationError: it is not a calibrated stereo pair.
     """
-    for side, info in (("left", left), ("right", right)):
-        if not (info.k[0, 0] > 0 or info.p[0, 0] > 0):
-            raise CalibrationError(
-                f"the {side} camera is not calibrated: its camera matrix holds only zeros"
-            )
-    if rectified or (left.is_ideal and right.is_ideal):
-        return _rectified(left, right, right_from_left, left_from_rig)
-    if right_from_left is None or right.p[0, 3] != 0:
-        right_from_left = _relative_pose(left, right)
+    _check_sizes(left, right)
+    stated = left.projects and right.projects
+    left, right = _completed(left, "left"), _completed(right, "right")
+    baseline_m = float(left.p[0, 3] - right.p[0, 3]) / float(left.p[0, 0])
+    if baseline_m == 0 and right_from_left is None:
+        raise _no_baseline(left, right)
+    if rectified:
+        left, right = (_seen_through_p(one, stated=stated) for one in (left, right))
+        _check_rows(left, right)
+    ideal = left.is_ideal and right.is_ideal and _apart_px(left, right) <= _SAME_PX
+    if baseline_m == 0 and right_from_left is not None:
+        # Two projections without a baseline do not say that the cameras are aligned.
+        if ideal and (rectified or _is_aligned(right_from_left)):
+            return _rectified(left, right_from_left.distance_m, left_from_rig)
+    elif ideal:
+        return _rectified(left, baseline_m, left_from_rig)
+    if baseline_m != 0:
+        right_from_left = _relative_pose(left, right, baseline_m)
+    assert right_from_left is not None
     raw = RawStereoCalibration(left.lens, right.lens, right_from_left, left_from_rig)
-    return rectified_cameras(raw, field_of_view_deg)
+    return _with_doubts(rectified_cameras(raw, field_of_view_deg), baseline_m)
 
 
-def _rectified(
-    left: CameraInfo, right: CameraInfo, right_from_left: SE3 | None, mounting: SE3 | None
-) -> Cameras:
-    apart_px = np.abs(left.p[:2, :3] - right.p[:2, :3]).max()
+def _check_sizes(left: CameraInfo, right: CameraInfo) -> None:
+    if (left.width, left.height) != (right.width, right.height):
+        raise CalibrationError(
+            f"the left images are {left.width}×{left.height} px, the right ones {right.width}×"
+            f"{right.height}: a stereo pair needs equal sizes; set both cameras to one resolution, "
+            "or scale the images of one and with them its fx, fy, cx and cy"
+        )
+
+
+def _seen_through_p(info: CameraInfo, *, stated: bool) -> CameraInfo:
+    """The camera of rectified images, whose projection is all that counts.
+
+    Args:
+        info: the camera; K stands for P where that is zero.
+        stated: whether P is not zero.
+    """
+    if not stated and any(info.d):
+        raise CalibrationError(
+            "the images are rectified, but P, which describes rectified images, is zero; name the "
+            "raw topics with --left and --right, or give the calibration of the rectified images "
+            "with --calibration FILE"
+        )
+    lens = DistortionModel.NONE
+    return replace(info, k=info.p[:, :3], r=np.eye(3), model=lens, d=())
+
+
+def _check_rows(left: CameraInfo, right: CameraInfo) -> None:
+    apart_px = np.abs(left.p[1, :3] - right.p[1, :3]).max()
     if apart_px > _SAME_PX:
         raise CalibrationError(
-            f"the projections of the rectified images differ by {apart_px:.4g} px: they are not a "
-            "rectified pair"
+            f"the projections of the rectified images differ by {apart_px:.4g} px in their rows: "
+            "they are not a rectified pair; name the raw topics with --left and --right, or "
+            "calibrate the pair again"
         )
-    fx = float(left.p[0, 0])
-    baseline_m = round(float(left.p[0, 3] - right.p[0, 3]) / fx, 9)
-    if baseline_m == 0 and right_from_left is not None:
-        baseline_m = round(right_from_left.distance_m, 9)
-    if baseline_m <= 0:
-        raise _no_baseline(baseline_m)
-    return Cameras(
-        StereoCamera(
-            fx,
-            float(left.p[1, 1]),
-            float(left.p[0, 2]),
-            float(left.p[1, 2]),
-            baseline_m,
-            left.width,
-            left.height,
-            mounting,
-        )
+
+
+def _apart_px(left: CameraInfo, right: CameraInfo) -> float:
+    return float(np.abs(left.p[:2, :3] - right.p[:2, :3]).max())
+
+
+def _completed(info: CameraInfo, side: str) -> CameraInfo:
+    try:
+        return info.completed()
+    except CalibrationError as error:
+        raise CalibrationError(
+            f"the {side} camera {error}; calibrate the pair, or give its calibration with "
+            "--calibration FILE"
+        ) from error
+
+
+def _is_aligned(right_from_left: SE3) -> bool:
+    """Whether rows of two ideal cameras correspond."""
+    _, y, z = np.abs(right_from_left.translation)
+    return right_from_left.angle_rad < _PARALLEL_RAD and max(y, z) < (
+        _LEVEL * right_from_left.distance_m
     )
 
 
-def _relative_pose(left: CameraInfo, right: CameraInfo) -> SE3:
+def _rectified(info: CameraInfo, baseline_m: float, mounting: SE3 | None) -> Cameras:
+    """The pair of rectified images, whatever the sign of the baseline."""
+    (fx, _, cx), (_, fy, cy) = info.p[:2, :3].tolist()
+    width, height = info.width, info.height
+    length_m = round(abs(baseline_m), 9)
+    camera = StereoCamera(fx, fy, cx, cy, length_m, width, height, mounting)
+    return _with_doubts(Cameras(camera), baseline_m)
+
+
+def _relative_pose(left: CameraInfo, right: CameraInfo, baseline_m: float) -> SE3:
     """right_from_left of the raw cameras, from their rotations and the baseline in P."""
-    fx = float(right.p[0, 0])
-    baseline_m = float(left.p[0, 3] - right.p[0, 3]) / fx if fx > 0 else 0.0
-    if baseline_m <= 0:
-        raise _no_baseline(baseline_m)
-    shift = np.array([-baseline_m, 0.0, 0.0])
-    return SE3(right.r.T @ left.r, right.r.T @ shift)
+    return SE3(right.r.T @ left.r, right.r.T @ np.array([-abs(baseline_m), 0.0, 0.0]))
 
 
-def _no_baseline(baseline_m: float) -> CalibrationError:
+def _with_doubts(cameras: Cameras, baseline_m: float) -> Cameras:
+    """The cameras, with what people should know of the baseline that P states."""
     if baseline_m < 0:
+        note = (
+            f"the projections state a baseline of {baseline_m:.6g} m: P[3] of the right camera is "
+            f"positive, and must be −fx·baseline; read as {-baseline_m:.6g} m, as the images of "
+            "left and right are in order"
+        )
+        return replace(cameras, sides_doubtful=True, notes=(note,))
+    if 0 < baseline_m < _SHORTEST_BASELINE_M:
+        note = (
+            f"the baseline is {1000 * baseline_m:.3g} mm: P[3] of the right camera must be "
+            "−fx·baseline, in px·m; is it the baseline alone, or another unit?"
+        )
+        return replace(cameras, notes=(note,))
+    return cameras
+
+
+def _no_baseline(left: CameraInfo, right: CameraInfo) -> CalibrationError:
+    rise_m = float(left.p[1, 3] - right.p[1, 3]) / float(left.p[1, 1])
+    if rise_m != 0:
+        turn = "anticlockwise" if rise_m > 0 else "clockwise"
         return CalibrationError(
-            f"the projections give a baseline of {baseline_m:.6g} m, must be > 0: are left and "
-            "right swapped?"
+            f"the projections state that the cameras are {abs(rise_m):.4g} m one above the other, "
+            f"and Engram needs them side by side; turn all images by 90° {turn} and calibrate the "
+            "turned ones"
         )
     return CalibrationError(
         "the right camera's projection P states no baseline: each camera was calibrated alone; "
-        "give the pair's calibration with --calibration FILE"
+        "give a calibration of the pair with --calibration FILE"
     )

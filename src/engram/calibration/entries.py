@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -17,18 +18,25 @@ from engram.geometry.rectification import DistortionModel
 # A calibration has a few kilobytes; this bounds the parser's work on malicious files.
 MAX_CHARACTERS = 100_000
 
-# Names of lens models that common calibration tools write.
+# Names of lens models that common calibration tools and drivers write.
 _DISTORTION = {
-    "radial-tangential": DistortionModel.RADIAL_TANGENTIAL,
+    "radial_tangential": DistortionModel.RADIAL_TANGENTIAL,
     "radtan": DistortionModel.RADIAL_TANGENTIAL,
     "plumb_bob": DistortionModel.RADIAL_TANGENTIAL,
     "rational_polynomial": DistortionModel.RADIAL_TANGENTIAL,
+    "brown_conrady": DistortionModel.RADIAL_TANGENTIAL,
     "equidistant": DistortionModel.EQUIDISTANT,
+    "equi": DistortionModel.EQUIDISTANT,
     "fisheye": DistortionModel.EQUIDISTANT,
     "kannala_brandt": DistortionModel.EQUIDISTANT,
+    "kannala_brandt4": DistortionModel.EQUIDISTANT,
     "none": DistortionModel.NONE,
+    "pinhole": DistortionModel.NONE,
+    "perspective": DistortionModel.NONE,
     "": DistortionModel.NONE,
 }
+# Models that are not read, but whose lens with coefficients of zero has no distortion.
+_IDEAL_AT_ZERO = ("inverse_brown_conrady", "modified_brown_conrady")
 
 
 def read_yaml(text: str) -> dict[str, Any]:
@@ -137,26 +145,61 @@ def distortion_model(value: Any, name: str = "distortion_model") -> DistortionMo
     Raises:
         CalibrationError: it is unknown or not supported.
     """
-    text = str(value).strip().lower()
+    text = _model_name(value)
     if text not in _DISTORTION:
         known = ", ".join(name for name in _DISTORTION if name)
-        raise CalibrationError(f"{name} is {text[:40]!r}; known: {known}")
+        raise CalibrationError(
+            f"{name} is {text[:40]!r}; known: {known}; calibrate the lenses again with one of "
+            "them, or give rectified images"
+        )
     return _DISTORTION[text]
+
+
+def _model_name(value: Any) -> str:
+    """A model's name in one spelling: small letters, words joined by underscores."""
+    return re.sub(r"[\s_-]+", "_", str(value).strip().lower())
+
+
+def lens_of(
+    model: Any, values: Callable[[set[int]], list[float]]
+) -> tuple[DistortionModel, tuple[float, ...]]:
+    """Model and coefficients of a lens; those of a model that is not read may all be zero.
+
+    Args:
+        model: name of the model.
+        values: reads the coefficients; is given the allowed counts.
+
+    Raises:
+        CalibrationError: the model is unknown, or the coefficients do not fit it.
+    """
+    if _model_name(model) in _IDEAL_AT_ZERO and not any(values({4, 5, 8, 12, 14})):
+        return DistortionModel.NONE, ()
+    return coefficients(distortion_model(model), values)
 
 
 def coefficients(
     model: DistortionModel, values: Callable[[set[int]], list[float]]
 ) -> tuple[DistortionModel, tuple[float, ...]]:
-    """Model and coefficients in Engram's form; five zeros of an ideal lens are no distortion.
+    """Model and coefficients in Engram's form; zeros of an ideal lens are no distortion.
 
     Args:
         model: the stated model.
         values: reads the list; is given the allowed counts.
+
+    Raises:
+        CalibrationError: the lens has terms that are not supported.
     """
     if model is DistortionModel.NONE:
         return model, ()
-    counts = {4} if model is DistortionModel.EQUIDISTANT else {4, 5, 8}
-    found = values(counts)
-    if model is DistortionModel.RADIAL_TANGENTIAL and not any(found):
+    fisheye = model is DistortionModel.EQUIDISTANT
+    used = 4 if fisheye else 8
+    # Drivers fill up with zeros: OpenCV's thin prisms and tilts, and Brown's k3 of a fisheye.
+    found = values({4, 5, 8} if fisheye else {4, 5, 8, 12, 14})
+    if any(found[used:]):
+        more = "more than 4 coefficients" if fisheye else "thin-prism or tilt terms"
+        raise CalibrationError(
+            f"the lens has {more}, which are not supported; calibrate again without them"
+        )
+    if not fisheye and not any(found):
         return DistortionModel.NONE, ()
-    return model, tuple(found)
+    return model, tuple(found[:used])

@@ -1,17 +1,18 @@
 """Kalibr's `camchain.yaml`: two pinhole cameras with radtan or equidistant lenses.
 
 Source: Kalibr wiki, "Yaml formats": intrinsics [fu, fv, pu, pv]; ``T_cn_cnm1`` takes points from
-the previous camera of the chain to this one; ``T_cam_imu`` from the IMU to the camera.
+the previous camera of the chain to this one; ``T_cam_imu`` from the IMU to the camera. The chain
+has the cameras in the order in which their topics were named: either may be the left one.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+from engram.calibration.cameras import Cameras, cameras_in_order
 from engram.calibration.entries import (
-    coefficients,
-    distortion_model,
     entry,
+    lens_of,
     numbers,
     transform,
     whole,
@@ -25,13 +26,12 @@ def is_camchain(entries: dict[str, Any]) -> bool:
     return isinstance(entries.get("cam0"), dict)
 
 
-def parse_camchain(
-    entries: dict[str, Any],
-) -> tuple[RawStereoCalibration, tuple[str, str] | None]:
-    """The first two cameras of a chain, cam0 left, and their image topics.
+def parse_camchain(entries: dict[str, Any], field_of_view_deg: float | None = None) -> Cameras:
+    """The first two cameras of a chain, in either order, and their image topics.
 
     Raises:
-        CalibrationError: an entry is missing, malformed, or of a kind that is not supported.
+        CalibrationError: an entry is missing, malformed, or of a kind that is not supported; or the
+            cameras are not a stereo pair.
     """
     sides = [entry(entries, name) for name in ("cam0", "cam1")]
     lenses = []
@@ -42,12 +42,12 @@ def parse_camchain(
             lenses.append(_lens(side))
         except CalibrationError as error:
             raise CalibrationError(f"{name}: {error}") from error
-    left, right = sides
-    right_from_left = transform(right, "T_cn_cnm1")
-    left_from_rig = transform(left, "T_cam_imu") if "T_cam_imu" in left else None
-    topics = (str(left.get("rostopic", "")), str(right.get("rostopic", "")))
-    calibration = RawStereoCalibration(lenses[0], lenses[1], right_from_left, left_from_rig)
-    return calibration, topics if all(topics) else None
+    first, second = sides
+    second_from_first = transform(second, "T_cn_cnm1")
+    first_from_rig = transform(first, "T_cam_imu") if "T_cam_imu" in first else None
+    topics = (str(first.get("rostopic", "")), str(second.get("rostopic", "")))
+    chain = RawStereoCalibration(lenses[0], lenses[1], second_from_first, first_from_rig)
+    return cameras_in_order(chain, field_of_view_deg, topics if all(topics) else None)
 
 
 def _lens(side: dict[str, Any]) -> RawCamera:
@@ -59,8 +59,8 @@ def _lens(side: dict[str, Any]) -> RawCamera:
         )
     fx, fy, cx, cy = numbers(side, "intrinsics", {4})
     width, height = (whole(value) for value in numbers(side, "resolution", {2}))
-    lens = coefficients(
-        distortion_model(entry(side, "distortion_model")),
+    lens = lens_of(
+        entry(side, "distortion_model"),
         lambda counts: numbers(side, "distortion_coeffs", counts),
     )
     return RawCamera(fx, fy, cx, cy, width, height, *lens)

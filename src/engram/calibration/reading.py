@@ -59,8 +59,7 @@ def read_calibration(
             return parse_toml(text, field_of_view_deg)
         entries = read_yaml(text)
         if is_camchain(entries):
-            raw, topics = parse_camchain(entries)
-            return rectified_cameras(raw, field_of_view_deg, topics)
+            return parse_camchain(entries, field_of_view_deg)
         if is_camera_info(entries):
             infos = [parse_camera_info(one) for one in (entries, _partner(path))]
             return cameras_of_infos(

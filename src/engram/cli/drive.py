@@ -186,6 +186,7 @@ def _bag_text(facts: BagFacts) -> str:
         lines.append(f"mounting: {facts.mounting or 'unknown'}")
     if facts.transforms:
         lines.append(f"static transforms: {', '.join(facts.transforms)}")
+    lines += [f"note: {note}" for note in facts.notes]
     if facts.question:
         lines.append(f"missing: {facts.question}")
     lines += [f"lost: {loss}" for loss in facts.lost]
@@ -199,6 +200,8 @@ def _size(size_bytes: int) -> str:
 
 
 def _drive_facts(path: Path, opening: options.Drive) -> dict[str, Any]:
+    from engram.sequences import ImageSequence
+
     sequence = opening.open(path)
     stamps_ns = getattr(sequence, "stamps_ns", None)
     seconds = 0.0 if stamps_ns is None else float(stamps_ns[-1] - stamps_ns[0]) / 1e9
@@ -209,6 +212,7 @@ def _drive_facts(path: Path, opening: options.Drive) -> dict[str, Any]:
         "pairs": len(sequence),
         "duration_s": seconds,
         **{name: getattr(sequence.camera, name) for name in _CAMERA},
+        "notes": list(sequence.cameras.notes) if isinstance(sequence, ImageSequence) else [],
         "command": f"engram map MAP.engram {path}",
     }
 
@@ -219,5 +223,6 @@ def _drive_text(facts: dict[str, Any]) -> str:
         f"{facts['duration_s']:.1f} s, clock {facts['clock']}\n"
         f"camera: {facts['width']}×{facts['height']} px, fx {facts['fx']:.1f} px, baseline "
         f"{facts['baseline_m']:.4f} m\n"
-        f"next: {facts['command']}"
+        + "".join(f"note: {note}\n" for note in facts["notes"])
+        + f"next: {facts['command']}"
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -26,6 +26,7 @@ def losses_told(sequence: Drive) -> Iterator[None]:
     Raises:
         Exit: parts of the bag were lost; what could be read was used.
     """
+    _noted(sequence)
     try:
         yield
     except (EngramError, VerbInterruptedError, typer.Exit):
@@ -33,6 +34,19 @@ def losses_told(sequence: Drive) -> Iterator[None]:
         raise
     if _told(sequence, "parts of the bag could not be read; the rest was used:"):
         raise typer.Exit(EXIT_DAMAGED)
+
+
+def _noted(sequence: Drive) -> None:
+    """Says what of a drive's calibration was read otherwise than it is written."""
+    from engram.sequences import BagSequence, ImageSequence
+
+    notes: Sequence[str] = ()
+    if isinstance(sequence, BagSequence):
+        notes = sequence.notes
+    elif isinstance(sequence, ImageSequence):
+        notes = sequence.cameras.notes
+    for note in notes:
+        typer.echo(f"note: {note}", err=True)
 
 
 def _told(sequence: Drive, heading: str) -> bool:

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from engram.doctor.rematching import APART, MOST, Rematched
 from engram.doctor.settings import DoctorConfig
-from engram.doctor.sides import Alignment, SideMatches, match_sides
+from engram.doctor.sides import Alignment
 from engram.frontend import Frame, FrameStatus, StereoPair
 from engram.frontend.matching import MatcherConfig
+from engram.frontend.sides import SideMatches, match_sides
 from engram.geometry import SE3, StereoCamera
 from engram.graph.model import Clock
 from engram.odometry import Motion, OdometryStatus

@@ -28,6 +28,9 @@ _METHOD = "bouguet-1"
 # so without a choice it ends here, horizontally.
 _WIDEST_FISHEYE_DEG = 100.0
 
+# Cameras closer than this stand at one place, metres.
+_SAME_PLACE_M = 1e-4
+
 # Larger images are refused: the four tables of a pair take 12 bytes a pixel.
 _MAX_SIDE_PX = 16_384
 _MAX_PIXELS = 64_000_000
@@ -125,6 +128,22 @@ class RawStereoCalibration:
     right_from_left: SE3
     left_from_rig: SE3 | None = None
 
+    @property
+    def is_exchanged(self) -> bool:
+        """Whether the camera called right is the left one of a pair side by side."""
+        x, y, _ = self.right_from_left.inverse().translation
+        return bool(x < -abs(y))
+
+    def exchanged(self) -> RawStereoCalibration:
+        """The same pair with the names of the two cameras exchanged."""
+        mounting = self.left_from_rig
+        return RawStereoCalibration(
+            self.right,
+            self.left,
+            self.right_from_left.inverse(),
+            None if mounting is None else self.right_from_left @ mounting,
+        )
+
     def content_hash(self, field_of_view_deg: float | None = None) -> str:
         """Hash of the calibration without the mounting, 32 hexadecimal digits."""
         content = [_METHOD]
@@ -212,21 +231,41 @@ def _check_pair(calibration: RawStereoCalibration) -> None:
     if (left.width, left.height) != (right.width, right.height):
         raise CalibrationError(
             f"left images are {left.width}×{left.height}, right ones {right.width}×{right.height}: "
-            "a stereo pair needs equal sizes"
+            "a stereo pair needs equal sizes; set both cameras to one resolution, or scale the "
+            "images of one and with them its fx, fy, cx and cy"
         )
     fisheye = [camera.distortion is DistortionModel.EQUIDISTANT for camera in (left, right)]
     if fisheye[0] != fisheye[1]:
         raise CalibrationError(
             f"left lens is {left.distortion.value!r}, right lens {right.distortion.value!r}: "
-            "a fisheye pairs only with a fisheye"
+            "a fisheye pairs only with a fisheye; calibrate both with one model"
         )
-    right_in_left = calibration.right_from_left.inverse().translation
-    if not (right_in_left[0] > 0 and right_in_left[0] > abs(right_in_left[1])):
-        offset = ", ".join(f"{value:.4f}" for value in right_in_left)
+    _check_places(calibration)
+
+
+def _check_places(calibration: RawStereoCalibration) -> None:
+    """Refuses a pair whose right camera is not to the right of the left one."""
+    x, y, z = calibration.right_from_left.inverse().translation + 0.0
+    if x > 0 and x > abs(y):
+        return
+    where = f"the right camera is at ({x:.4f}, {y:.4f}, {z:.4f}) m in the left one's frame"
+    if max(abs(x), abs(y), abs(z)) < _SAME_PLACE_M:
         raise CalibrationError(
-            f"the right camera is at ({offset}) m in the left one's frame: x must be positive "
-            "and the largest part; swap the two cameras or correct the extrinsics"
+            f"{where}: the calibration states no distance between the cameras; calibrate the two "
+            "together, or fill in the pose of one in the other"
         )
+    where += ": x must be positive and the largest part"
+    if abs(y) >= abs(x):
+        turn = "anticlockwise" if y > 0 else "clockwise"
+        raise CalibrationError(
+            f"{where}. The cameras are one above the other, and Engram needs them side by side: "
+            f"turn all images by 90° {turn} and calibrate the turned ones"
+        )
+    raise CalibrationError(
+        f"{where}. If the images of left and right are in order, the pose is the inverse of what "
+        "it must be, that of the left camera in the right one's frame: invert it; otherwise swap "
+        "the two cameras in the calibration. engram doctor tells whether the images are swapped"
+    )
 
 
 def _check_rectified(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
@@ -11,9 +11,19 @@ from numpy.typing import NDArray
 
 from engram.calibration import Cameras, read_calibration
 from engram.errors import CalibrationError, ConfigError, InputError
+from engram.frontend import StereoPair
+from engram.frontend.sides import match_sides
 from engram.sequences.images import image_size, read_image
 from engram.sequences.listing import image_files
 from engram.sequences.options import OpenOptions
+
+# Disparities below this have no sign, px; so many others tell left from right, and such a share of
+# them is negative where the two are exchanged.
+_NO_DISPARITY_PX = 1.0
+_ENOUGH = 200
+_EXCHANGED = 0.5
+# Pairs of a drive that are looked at, at most: every tenth, as the first may be dark.
+TELLING = slice(0, 300, 10)
 
 
 def cameras_of(
@@ -22,6 +32,7 @@ def cameras_of(
     folder: Path | None = None,
     *,
     rectified: bool = False,
+    halves: bool = False,
 ) -> Cameras:
     """The calibration that the caller gave, or else the drive's own.
 
@@ -30,6 +41,7 @@ def cameras_of(
         own: reads the drive's own calibration.
         folder: of the left images, for calibrations that state no image size.
         rectified: whether the images are rectified.
+        halves: whether each image holds both sides.
 
     Raises:
         CalibrationError: it cannot be used.
@@ -39,9 +51,14 @@ def cameras_of(
     return read_calibration(
         options.calibration,
         rectified=rectified,
-        size=None if folder is None else (lambda: image_size(image_files(folder)[0])),
+        size=None if folder is None else (lambda: _size_in(folder, halves=halves)),
         field_of_view_deg=options.field_of_view_deg,
     )
+
+
+def _size_in(folder: Path, *, halves: bool) -> tuple[int, int]:
+    width, height = image_size(image_files(folder)[0])
+    return (width // 2, height) if halves else (width, height)
 
 
 def read_mask(path: Path, cameras: Cameras) -> NDArray[np.bool_]:
@@ -72,6 +89,57 @@ def read_mask(path: Path, cameras: Cameras) -> NDArray[np.bool_]:
     if not mask.any():
         raise ConfigError(f"mask {path}: is black throughout; white is what is used")
     return mask
+
+
+def scaled_by(stated: tuple[int, int], size: tuple[int, int]) -> str:
+    """How a calibration of scaled images is mended; "" if the images are not scaled ones.
+
+    Args:
+        stated: width and height that the calibration states, px.
+        size: those of the images, px.
+    """
+    ratio = size[0] / stated[0]
+    if stated == size or abs(ratio * stated[1] - size[1]) > 1:
+        return ""
+    return (
+        f"; if the images were scaled, multiply fx, fy, cx and cy of the calibration by "
+        f"{ratio:.6g}, and state width {size[0]} and height {size[1]}"
+    )
+
+
+def check_sides(cameras: Cameras, pairs: Iterable[StereoPair], where: object) -> None:
+    """Refuses a drive whose images agree that its left and right are exchanged.
+
+    Nothing is looked at unless the calibration's sign raises the doubt.
+
+    Args:
+        cameras: of the drive.
+        pairs: some of its rectified pairs; read until they tell.
+        where: the drive, for messages.
+
+    Raises:
+        CalibrationError: near things lie further right in the right images, or no image tells.
+    """
+    if not cameras.sides_doubtful:
+        return
+    shifts: list[float] = []
+    for pair in pairs:
+        shifts += match_sides(pair).shift[:, 0].tolist()
+        shifts = [one for one in shifts if abs(one) > _NO_DISPARITY_PX]
+        if len(shifts) >= _ENOUGH:
+            break
+    if len(shifts) < _ENOUGH:
+        raise CalibrationError(
+            f"{where}: are left and right swapped? the projections state a negative baseline, and "
+            "the images do not tell; exchange the two, or make P[3] of the right camera negative, "
+            "−fx·baseline"
+        )
+    if np.mean(np.array(shifts) < 0) > _EXCHANGED:
+        raise CalibrationError(
+            f"{where}: left and right are swapped: the projections state a negative baseline, and "
+            "near things lie further right in the right images; exchange the two folders, or "
+            "topics (--left, --right)"
+        )
 
 
 def check_no_view(options: OpenOptions, cameras: Cameras) -> None:

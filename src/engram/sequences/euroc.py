@@ -11,8 +11,8 @@ from pathlib import Path
 from engram.calibration import Cameras, read_calibration
 from engram.calibration.cameras import rectified_cameras
 from engram.calibration.entries import (
-    distortion_model,
     entry,
+    lens_of,
     numbers,
     read_yaml,
     transform,
@@ -20,7 +20,7 @@ from engram.calibration.entries import (
 )
 from engram.errors import CalibrationError, InputError, SequenceError
 from engram.geometry import SE3
-from engram.geometry.rectification import DistortionModel, RawCamera, RawStereoCalibration
+from engram.geometry.rectification import RawCamera, RawStereoCalibration
 from engram.graph.model import Clock
 from engram.sequences.calibrating import cameras_of
 from engram.sequences.image_sequence import ImageDrive
@@ -85,6 +85,8 @@ def _find(
 ) -> ImageDrive:
     sides = [_mav_folder(path) / camera for camera in ("cam0", "cam1")]
     calibrated = cameras_of(options, cameras, sides[0] / "data")
+    if calibrated.right_first:
+        sides.reverse()
     left, right = (list(_stamped_files(side)) for side in sides)
     tables = (sides[0] / "data.csv", sides[1] / "data.csv")
     places = pair_by_stamp(left, right, options.pair_tolerance_ns, tables)
@@ -151,13 +153,11 @@ def _read_sensor(path: Path) -> tuple[RawCamera, SE3]:
         camera_model = str(entries.get("camera_model", "pinhole")).strip().lower()
         if camera_model != "pinhole":
             raise CalibrationError(f"camera_model is {camera_model[:40]!r}, must be 'pinhole'")
-        model = distortion_model(entry(entries, "distortion_model"))
-        coefficients = (
-            ()
-            if model is DistortionModel.NONE
-            else tuple(numbers(entries, "distortion_coefficients", {4, 5, 8}))
+        lens = lens_of(
+            entry(entries, "distortion_model"),
+            lambda counts: numbers(entries, "distortion_coefficients", counts),
         )
-        camera = RawCamera(fx, fy, cx, cy, width, height, model, coefficients)
+        camera = RawCamera(fx, fy, cx, cy, width, height, *lens)
         return camera, transform(entries, "T_BS")
     except InputError as error:
         raise CalibrationError(f"{path}: {error}") from error

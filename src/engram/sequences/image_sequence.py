@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 
@@ -18,8 +19,8 @@ from engram.frontend import StereoPair
 from engram.geometry.rectification import Rectification, RemapTable
 from engram.graph.model import Clock
 from engram.odometry import MotionSource
-from engram.sequences.calibrating import check_no_view, read_mask
-from engram.sequences.images import image_bits, read_image
+from engram.sequences.calibrating import TELLING, check_no_view, check_sides, read_mask, scaled_by
+from engram.sequences.images import image_bits, image_size, read_image
 from engram.sequences.listing import Listing, PairFiles, usable_pairs
 from engram.sequences.motion import motion_of_files
 from engram.sequences.options import Channel, OpenOptions
@@ -76,8 +77,11 @@ class ImageSequence:
         self._pairs, self._listing_faults = usable_pairs(
             places, options.skip_bad, drive.path, partial(_chosen, options)
         )
+        self._check_sizes()
         self._mask = None if options.mask is None else read_mask(options.mask, drive.cameras)
         self._reading_faults: list[str] = []
+        telling = range(len(self._pairs))[TELLING]
+        check_sides(drive.cameras, self.usable(telling), drive.path)
 
     @property
     def rectification(self) -> Rectification | None:
@@ -157,16 +161,51 @@ class ImageSequence:
         """
         files = self._pairs[index]
         rectification = self.cameras.rectification
-        left = self._load(files.left, rectification.left if rectification else None)
-        right = self._load(files.right, rectification.right if rectification else None)
+        left, right = self._load(files)
+        if rectification is not None:
+            left, right = rectified(left, rectification.left), rectified(right, rectification.right)
         return StereoPair(files.stamp_ns, left, right, self.camera, self._mask)
 
-    def _load(self, path: Path, table: RemapTable | None) -> NDArray[np.uint8]:
-        # Rectification keeps the image size.
-        image = self._drive.read(path, self.camera.width, self.camera.height, self._options.channel)
-        if table is None:
-            return image
-        return rectified(image, table)
+    def _check_sizes(self) -> None:
+        """Refuses a calibration of another image size; one wrong image alone is a bad pair."""
+        sizes = set()
+        for pair in (self._pairs[0], self._pairs[-1]):
+            with suppress(SequenceError):
+                width, height = image_size(pair.left)
+                sizes.add((width // 2, height) if pair.left == pair.right else (width, height))
+        stated = self.camera.width, self.camera.height
+        if len(sizes) != 1 or stated in sizes:
+            return
+        size = sizes.pop()
+        raise SequenceError(
+            f"{self._pairs[0].left}: the images are {size[0]}×{size[1]} px, the calibration says "
+            f"{stated[0]}×{stated[1]}: give the calibration of these images"
+            f"{scaled_by(stated, size)}"
+        )
+
+    def _load(self, files: PairFiles) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """The two images, not rectified; rectification keeps their size."""
+        width, height, channel = self.camera.width, self.camera.height, self._options.channel
+        if files.left == files.right:
+            both = self._drive.read(files.left, 2 * width, height, channel)
+            return half(both, Side.LEFT), half(both, Side.RIGHT)
+        left, right = (
+            self._drive.read(path, width, height, channel) for path in (files.left, files.right)
+        )
+        return left, right
+
+
+class Side(StrEnum):
+    """A side of an image that holds both of a pair's, side by side."""
+
+    LEFT = "left"
+    RIGHT = "right"
+
+
+def half(image: NDArray[np.uint8], side: Side) -> NDArray[np.uint8]:
+    """The (h, w / 2) uint8 image of one side of a (h, w) image that holds both."""
+    width = image.shape[1] // 2
+    return np.ascontiguousarray(image[:, :width] if side is Side.LEFT else image[:, -width:])
 
 
 def rectified(image: NDArray[np.uint8], table: RemapTable) -> NDArray[np.uint8]:

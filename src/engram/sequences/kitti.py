@@ -148,7 +148,8 @@ class _Calibration:
         if not baseline_m > 0:
             raise CalibrationError(
                 f"{self.path}: {left} and {right} give a baseline of {baseline_m:.6g} m, "
-                "must be > 0: left and right may be swapped"
+                f"must be > 0: the fourth number of {right} must be −fx·baseline; change its sign, "
+                "and engram doctor tells whether the images are exchanged"
             )
         try:
             return StereoCamera(

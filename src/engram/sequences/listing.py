@@ -23,6 +23,8 @@ from engram.untrusted import read_text
 # Stamps after the year 2200 are refused: they soon exceed 64 bits.
 _MAX_STAMP_NS = 2**63 - 1
 
+# Digits of a time since 1970 in other units than seconds.
+_UNITS = {13: "milliseconds", 16: "microseconds", 19: "nanoseconds"}
 _SECONDS = re.compile(r"[+-]?\d{1,12}(\.\d{0,30})?([eE][+-]?\d{1,2})?", re.ASCII)
 _NANOSECONDS = re.compile(r"\d{1,19}", re.ASCII)
 _DATE = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:\.(\d{1,12}))?Z?", re.ASCII)
@@ -77,7 +79,9 @@ def read_stamps(path: Path, parse: Callable[[str], int | None]) -> list[int]:
     for number, line in enumerate(lines, start=1):
         stamp_ns = parse(line.strip())
         if stamp_ns is None:
-            raise SequenceError(f"{path}: line {number} is not a stamp: {line[:60]!r}")
+            unit = _UNITS.get(len(line.strip().partition(".")[0])) if line[:1].isdigit() else None
+            asked = f"; is it in {unit}? stamps here are in seconds" if unit else ""
+            raise SequenceError(f"{path}: line {number} is not a stamp: {line[:60]!r}{asked}")
         stamps_ns.append(stamp_ns)
     if not stamps_ns:
         raise SequenceError(f"{path}: holds no stamp")

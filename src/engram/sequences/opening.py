@@ -7,15 +7,17 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from types import MappingProxyType
 from typing import Any, TypeAlias, TypedDict, Unpack
 
 from engram.errors import ConfigError, SequenceError
 from engram.sequences.bags import BagSequence, is_bag, open_bag
 from engram.sequences.euroc import find_euroc, find_tumvi, is_euroc, is_tumvi
-from engram.sequences.folder import find_folder, is_folder
+from engram.sequences.folder import TEMPLATE, find_folder, is_folder
 from engram.sequences.framelog import FrameLog, is_framelog, open_framelog
 from engram.sequences.image_sequence import ImageDrive, ImageSequence
+from engram.sequences.images import IMAGE_SUFFIXES
 from engram.sequences.kitti import (
     find_kitti_odometry,
     find_kitti_raw,
@@ -35,6 +37,15 @@ from engram.sequences.robotcar import find_robotcar, is_robotcar
 
 Drive: TypeAlias = ImageSequence | BagSequence | FrameLog
 
+_VIDEOS = frozenset((".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".h264", ".h265"))
+_TEMPLATE_OF = (
+    "For rectified images it is this, with your numbers (of one half, for images in both/):\n"
+    f"{TEMPLATE}"
+)
+_RECORDINGS = {
+    ".svo": "ZED: export its images with the ZED SDK into left/ and right/, or record a bag",
+    ".svo2": "ZED: export its images with the ZED SDK into left/ and right/, or record a bag",
+}
 # Most drives listed if a parent folder is given.
 _MOST_NAMED = 10
 
@@ -84,7 +95,7 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
             _images(find_euroc),
         ),
         "folder": SequenceFormat(
-            "plain folder, left/, right/, calibration.toml and perhaps times.txt",
+            "plain folder, left/, right/ (or both/), calibration.toml and perhaps times.txt",
             is_folder,
             _images(find_folder),
         ),
@@ -242,7 +253,37 @@ def recognise(path: Path) -> str:
         named = "\n".join(f"  {one}" for one in inside[:_MOST_NAMED])
         more = f"\n  and {len(inside) - _MOST_NAMED} more" if len(inside) > _MOST_NAMED else ""
         raise SequenceError(f"{path}: is not a drive but holds some; name one of\n{named}{more}")
-    raise SequenceError(f"{path}: no drive of a known layout; known are\n{_known_layouts()}")
+    raise SequenceError(
+        _asked_of(path) or f"{path}: no drive of a known layout; known are\n{_known_layouts()}"
+    )
+
+
+def _asked_of(path: Path) -> str | None:
+    """What is to be done with a video, or with a folder of images; None for anything else."""
+    folder, suffix = quote(str(path.with_suffix(""))), path.suffix.lower()
+    if path.is_file() and suffix in _RECORDINGS:
+        return f"{path}: is a recording of {_RECORDINGS[suffix]}"
+    if path.is_file() and suffix in _VIDEOS:
+        return (
+            f"{path}: is a video, and Engram reads images. If each frame holds left and right side "
+            f"by side, extract them:\n  mkdir -p {folder}/both && ffmpeg -i {quote(str(path))} "
+            f"{folder}/both/%06d.png\nof two videos put the images of one into {folder}/left, "
+            f"those of the other into {folder}/right. Then write times.txt there (one line per "
+            f"pair, seconds) and calibration.toml. {_TEMPLATE_OF}"
+        )
+    images = next((one for one in (path, *_entries(path)) if _has_images(one)), None)
+    if images is None:
+        return None
+    return (
+        f"{path}: has images in {images}, but not of a known layout; put those of the left camera "
+        "into left/ and of the right one into right/, with the same names, or those that hold left "
+        "and right side by side into both/. Beside them write times.txt (one line per pair, "
+        f"seconds) and calibration.toml. {_TEMPLATE_OF}"
+    )
+
+
+def _has_images(folder: Path) -> bool:
+    return any(one.suffix.lower() in IMAGE_SUFFIXES for one in _entries(folder))
 
 
 def drives_inside(path: Path) -> list[Path]:

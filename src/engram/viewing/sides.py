@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.doctor.sides import align, match_sides
+from engram.doctor.sides import align
 from engram.frontend import StereoPair
+from engram.frontend.sides import match_sides
 
 _LINES = 40
 # Matches whose rows differ by more than this, or that lie further right in the right image.

@@ -1,8 +1,8 @@
-"""The calibration that a bag carries: `CameraInfo` and `/tf_static`."""
+"""The calibration that a bag carries: `CameraInfo`, `/tf_static`, and what of `/tf` is constant."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from itertools import islice
 from typing import Any
@@ -12,32 +12,44 @@ import numpy as np
 from engram.calibration import Cameras
 from engram.calibration.camera_info import CameraInfo, cameras_of_infos
 from engram.calibration.cameras import rectified_cameras
-from engram.calibration.entries import coefficients, distortion_model
+from engram.calibration.entries import lens_of
 from engram.errors import CalibrationError, InputError
 from engram.geometry import SE3
 from engram.sequences.bags.bag import Bag
 from engram.sequences.bags.messages import Decoder, same_type
 from engram.sequences.bags.records import DamageError
-from engram.sequences.bags.topics import StereoTopics, info_topic
+from engram.sequences.bags.topics import StereoTopics, info_topics
+from engram.sequences.calibrating import scaled_by
+from engram.sequences.motion import FORWARD
 
 _INFO = "sensor_msgs/msg/CameraInfo"
 _TF = "tf2_msgs/msg/TFMessage"
-STATIC = "/tf_static"
+# RealSense's own recorder states each stream's pose beside its images, in no frame.
+_POSE, _POSE_TOPIC = "geometry_msgs/msg/Transform", "tf/0"
+STATIC, MOVING = "/tf_static", "/tf"
 # Frames that stand for the robot, the best first (REP 105, REP 120).
 BASES = ("base_link", "base_footprint", "base", "body", "imu_link")
 # Static transforms come once, or again and again from several publishers.
 _MOST_MESSAGES = 50
+# Messages of /tf in which a mounting must be constant: half a minute at usual rates.
+_MOST_MOVING = 1500
+# A joint that moves by less stands still: encoders tremble.
+_STILL_M, _STILL_RAD = 1e-3, 2e-3
 
 
 class Transforms:
-    """The static transforms of a bag.
+    """The constant transforms of a bag.
 
     Attributes:
         parents: child frame → its parent and parent_from_child, metres.
+        moving: children of transforms that change during the drive.
     """
 
-    def __init__(self, parents: Mapping[str, tuple[str, SE3]]) -> None:
+    def __init__(
+        self, parents: Mapping[str, tuple[str, SE3]], moving: Collection[str] = ()
+    ) -> None:
         self.parents = dict(parents)
+        self.moving = frozenset(moving)
 
     def __len__(self) -> int:
         return len(self.parents)
@@ -55,6 +67,10 @@ class Transforms:
         above = {name.rsplit("/", 1)[-1]: name for name in self._chain(frame)}
         return next((above[base] for base in BASES if base in above), None)
 
+    def turning(self, frame: str) -> str | None:
+        """The frame above a camera's that moves against its parent; None if none does."""
+        return next((name for name in self._chain(frame) if name in self.moving), None)
+
     def _chain(self, frame: str) -> dict[str, SE3]:
         """Each frame above, with ancestor_from_frame; loops end."""
         frame = frame.lstrip("/")
@@ -71,43 +87,97 @@ class Transforms:
 def read_transforms(bag: Bag, decoder: Decoder) -> Transforms:
     """The static transforms; those that cannot be used are left out."""
     parents: dict[str, tuple[str, SE3]] = {}
-    for message in islice(_messages(bag, decoder, STATIC, _TF), _MOST_MESSAGES):
-        for one in message.transforms:
-            q, t = one.transform.rotation, one.transform.translation
-            try:
-                parent_from_child = SE3.from_quaternion([q.w, q.x, q.y, q.z], [t.x, t.y, t.z])
-            except InputError:
-                bag.note(f"{STATIC}: {one.child_frame_id[:60]!r} has no valid rotation")
-                continue
-            parents[one.child_frame_id.lstrip("/")] = (
-                one.header.frame_id.lstrip("/"),
-                parent_from_child,
-            )
+    for topic in _named(bag, STATIC):
+        for child, parent, pose in _poses(bag, decoder, topic, _MOST_MESSAGES):
+            parents[child] = (parent, pose)
     return Transforms(parents)
 
 
+def with_constant(static: Transforms, bag: Bag, decoder: Decoder, frame: str) -> Transforms:
+    """With the constant transforms of /tf, if the static ones do not lead to the robot's frame.
+
+    A joint's, or those of robots that publish all transforms again and again.
+
+    Args:
+        static: the static transforms.
+        bag: the bag.
+        decoder: decodes its messages.
+        frame: the camera's.
+    """
+    topics = _named(bag, MOVING)
+    if not frame or not topics or static.base_of(frame) is not None:
+        return static
+    first: dict[str, tuple[str, SE3]] = {}
+    moving: set[str] = set()
+    for topic in topics:
+        for child, parent, pose in _poses(bag, decoder, topic, _MOST_MOVING):
+            above, before = first.setdefault(child, (parent, pose))
+            moved = before.inverse() @ pose
+            if above != parent or moved.distance_m > _STILL_M or moved.angle_rad > _STILL_RAD:
+                moving.add(child)
+    constant = {child: one for child, one in first.items() if child not in moving}
+    return Transforms({**constant, **static.parents}, moving - static.parents.keys())
+
+
+def _named(bag: Bag, ending: str) -> list[str]:
+    """The topics of transforms of this name, in any namespace."""
+    return [
+        name
+        for name, topic in bag.topics.items()
+        if name.endswith(ending) and same_type(topic.type) == _TF
+    ]
+
+
+def _poses(bag: Bag, decoder: Decoder, topic: str, most: int) -> Iterator[tuple[str, str, SE3]]:
+    """Child, parent and parent_from_child of the transforms in the first messages of a topic."""
+    for message in islice(_messages(bag, decoder, topic, _TF), most):
+        for one in message.transforms:
+            pose = _pose(one.transform)
+            if pose is None:
+                bag.note(f"{topic}: {one.child_frame_id[:60]!r} has no valid rotation")
+                continue
+            yield one.child_frame_id.lstrip("/"), one.header.frame_id.lstrip("/"), pose
+
+
+def _pose(transform: Any) -> SE3 | None:
+    q, t = transform.rotation, transform.translation
+    try:
+        return SE3.from_quaternion([q.w, q.x, q.y, q.z], [t.x, t.y, t.z])
+    except InputError:
+        return None
+
+
 def read_infos(
-    bag: Bag, decoder: Decoder, stereo: StereoTopics
+    bag: Bag, decoder: Decoder, stereo: StereoTopics, size: tuple[int, int] | None = None
 ) -> tuple[CameraInfo, CameraInfo] | None:
     """The first `CameraInfo` of each camera; None if the bag lacks one.
 
-    Those beside the images, or the only two that the bag has: the right one states the baseline.
+    Those that belong to the images by their names, or the only two that the bag has: the right one
+    states the baseline.
+
+    Args:
+        bag: the bag.
+        decoder: decodes its messages.
+        stereo: the image topics.
+        size: of the images, px; None if unknown.
 
     Raises:
         CalibrationError: one is malformed.
     """
-    beside = [info_topic(image, bag.topics) for image in (stereo.left, stereo.right)]
     topics = [name for name, one in bag.topics.items() if same_type(one.type) == _INFO]
-    elsewhere = None in beside and len(topics) == 2
+    named = info_topics(stereo, topics)
+    found = topics if named is None else [named.left, named.right]
+    if len(found) != 2:
+        return None
     infos = []
-    for topic in topics if elsewhere else beside:
-        message = None if topic is None else next(_messages(bag, decoder, topic, _INFO), None)
-        if topic is None or message is None:
+    for topic in found:
+        message = next(_messages(bag, decoder, topic, _INFO), None)
+        if message is None:
             return None
-        infos.append((topic, _info(topic, message)))
-    if elsewhere:
-        infos.sort(key=lambda one: -one[1].p[0, 3])
-    (_, left), (_, right) = infos
+        infos.append(_info(topic, message, size, rectified=stereo.are_rectified))
+    if named is None:
+        infos.sort(key=lambda one: -one.p[0, 3])
+    left, right = infos
     return left, right
 
 
@@ -149,7 +219,13 @@ def read_cameras(
     Raises:
         CalibrationError: it does not, or what it says is not of a stereo pair.
     """
-    infos = read_infos(bag, decoder, stereo)
+    if stereo.are_halves:
+        raise CalibrationError(
+            f"{bag.path}: each image of {stereo.left} holds both sides, of {size[0]}×{size[1]} px; "
+            "give the calibration of the two halves with --calibration FILE (Kalibr's "
+            "camchain.yaml, ROS's left.yaml beside right.yaml, OpenCV's, or calibration.toml)"
+        )
+    infos = read_infos(bag, decoder, stereo, size)
     if infos is None:
         others = [name for name, one in bag.topics.items() if same_type(one.type) == _INFO]
         also = f" (those of {', '.join(others)} belong to other topics)" if others else ""
@@ -163,21 +239,58 @@ def read_cameras(
         raise CalibrationError(
             f"{bag.path}: the CameraInfo of the left camera is of {left.width}×{left.height} "
             f"px, the images of {stereo.left} are {size[0]}×{size[1]}: give the calibration of "
-            "these images with --calibration FILE"
+            f"these images with --calibration FILE{scaled_by((left.width, left.height), size)}"
         )
-    transforms = read_transforms(bag, decoder)
+    transforms = with_constant(read_transforms(bag, decoder), bag, decoder, left.frame)
     try:
         return cameras_of_infos(
             left,
             right,
             rectified=stereo.are_rectified,
-            right_from_left=transforms.between(right.frame, left.frame),
+            right_from_left=_right_from_left(bag, decoder, stereo, transforms, left, right),
             left_from_rig=mounting(transforms, left.frame),
             field_of_view_deg=field_of_view_deg,
         )
     except InputError as error:
         names = f"CameraInfo of {stereo.left} and {stereo.right}"
         raise CalibrationError(f"{bag.path}: {names}: {error}") from error
+
+
+def _right_from_left(
+    bag: Bag,
+    decoder: Decoder,
+    stereo: StereoTopics,
+    transforms: Transforms,
+    left: CameraInfo,
+    right: CameraInfo,
+) -> SE3 | None:
+    """Pose of the left camera in the right one by the bag's transforms; None without one."""
+    if left.frame != right.frame:
+        found = transforms.between(right.frame, left.frame)
+        if found is not None:
+            return _optical(found, left.frame, right.frame)
+    poses = [_stream_pose(bag, decoder, one) for one in (stereo.left, stereo.right)]
+    if poses[0] is None or poses[1] is None:
+        return None
+    # Of the two readings of such a pose, that by which the first camera is the left one.
+    found = poses[1] @ poses[0].inverse()
+    other = poses[1].inverse() @ poses[0]
+    return found if found.translation[0] < other.translation[0] else other
+
+
+def _optical(right_from_left: SE3, *frames: str) -> SE3:
+    """The same between optical frames: bodies have x forward and y left (REP 103)."""
+    x, y, _ = np.abs(right_from_left.translation)
+    if y <= x or any("optical" in frame for frame in frames):
+        return right_from_left
+    return FORWARD @ right_from_left @ FORWARD.inverse()
+
+
+def _stream_pose(bag: Bag, decoder: Decoder, image: str) -> SE3 | None:
+    """The pose that RealSense's recorder states beside a stream's images."""
+    topic = f"{image.removesuffix('/image/data')}/{_POSE_TOPIC}"
+    message = next(_messages(bag, decoder, topic, _POSE), None)
+    return None if message is None else _pose(message)
 
 
 def _messages(bag: Bag, decoder: Decoder, topic: str, kind: str) -> Iterator[Any]:
@@ -194,38 +307,57 @@ def _messages(bag: Bag, decoder: Decoder, topic: str, kind: str) -> Iterator[Any
             return
 
 
-def _info(topic: str, message: Any) -> CameraInfo:
+def _info(topic: str, message: Any, size: tuple[int, int] | None, *, rectified: bool) -> CameraInfo:
     names = ("d", "k", "r", "p") if hasattr(message, "k") else ("D", "K", "R", "P")
     d, k, r, p = (np.asarray(getattr(message, name), dtype=np.float64) for name in names)
     try:
         if not all(np.isfinite(one).all() for one in (d, k, r, p)):
             raise CalibrationError("has a number that is not finite")
-        if max(message.binning_x, message.binning_y) > 1 or message.roi.width:
-            raise CalibrationError(
-                "states binning or a region of interest, which is not supported; give the pair's "
-                "calibration with --calibration FILE"
-            )
-        model, coefficients_ = coefficients(
-            distortion_model(message.distortion_model), lambda counts: _counted(d, counts)
-        )
+        # The lens of rectified images has no part in them.
+        model = "none" if rectified and p[0] > 0 else message.distortion_model
+        lens = lens_of(model, lambda counts: _counted(d, counts))
     except CalibrationError as error:
         raise CalibrationError(f"{topic}: {error}") from error
-    return CameraInfo(
+    whole = CameraInfo(
         int(message.width),
         int(message.height),
-        model,
-        coefficients_,
+        *lens,
         k.reshape(3, 3),
         r.reshape(3, 3),
         p.reshape(3, 4),
-        str(message.header.frame_id),
+        str(message.header.frame_id).lstrip("/"),
     )
+    return _cut_out(whole, message, size)
+
+
+def _cut_out(info: CameraInfo, message: Any, size: tuple[int, int] | None) -> CameraInfo:
+    """The camera of the images that are sent: a region of the sensor, its pixels joined.
+
+    Some drivers state a region or binning and send whole images; the size of the images tells.
+    """
+    roi, joined = message.roi, (max(message.binning_x, 1), max(message.binning_y, 1))
+    region = (int(roi.width) or info.width, int(roi.height) or info.height)
+    if (*region, *joined) == (info.width, info.height, 1, 1):
+        return info
+    sent = (region[0] // joined[0], region[1] // joined[1])
+    if size is not None and sent != size:
+        return info
+    at = np.array([roi.x_offset, roi.y_offset], np.float64)
+    k, p = info.k.copy(), info.p.copy()
+    for matrix in (k, p):
+        matrix[:2, 2] = (matrix[:2, 2] - at * matrix[2, 2] + 0.5) / joined - 0.5
+        matrix[[0, 1], [0, 1]] /= joined
+    p[:2, 3] /= joined
+    return replace(info, width=sent[0], height=sent[1], k=k, p=p)
 
 
 def _counted(d: Any, counts: set[int]) -> list[float]:
     if len(d) == 0:  # drivers of rectified cameras leave it empty
         return [0.0] * min(counts)
-    if len(d) not in counts:
+    used = np.trim_zeros(np.asarray(d), "b")
+    fitting = [count for count in sorted(counts) if count >= len(used)]
+    if not fitting:
         wanted = " or ".join(map(str, sorted(counts)))
         raise CalibrationError(f"D has {len(d)} coefficients, must be {wanted}")
-    return [float(one) for one in d]
+    padded = np.pad(used, (0, fitting[0] - len(used)))
+    return [float(one) for one in padded]

@@ -7,10 +7,12 @@ Source: rosbag2_storage_sqlite3: tables `topics` (id, name, type, serialization_
 from __future__ import annotations
 
 import os
+import shutil
 import sqlite3
 from collections.abc import Collection, Iterator
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from engram.sequences.bags.compression import ZSTD_MAGIC, unpacked
 from engram.sequences.bags.records import (
@@ -20,6 +22,7 @@ from engram.sequences.bags.records import (
     Report,
     Topic,
     message_type,
+    topic_of,
 )
 from engram.untrusted import open_regular
 
@@ -35,6 +38,7 @@ class DatabaseBag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._copy: TemporaryDirectory[str] | None = None
 
     def topics(self, lost: Report) -> dict[str, Topic]:
         """The topics; see `BagFile`."""
@@ -74,18 +78,40 @@ class DatabaseBag:
         with os.fdopen(open_regular(self.path), "rb") as file:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise DamageError(f"{self.path}: is not an SQLite file")
-        # What a recorder did not move into the file yet lies beside it.
-        beside = self.path.with_name(self.path.name + "-wal").exists()
-        mode = "mode=ro" if beside else "mode=ro&immutable=1"
         try:
-            database = sqlite3.connect(f"{self.path.resolve().as_uri()}?{mode}", uri=True)
-            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BYTES)
-            database.execute("PRAGMA trusted_schema = OFF")
-            # The file is open for reading only; this lets SQLite read one that was cut short.
-            database.execute("PRAGMA writable_schema = ON")
+            if not _log_of(self.path).exists():
+                return _connected(self.path, "mode=ro&immutable=1")
+            # What a killed recorder did not move into the file lies beside it. SQLite reads both
+            # only where it can write an index beside them: not on a disk that is read-only.
+            database = _connected(self._copied() if self._copy else self.path, "mode=ro")
+            try:
+                database.execute("SELECT count(*) FROM sqlite_master")
+            except sqlite3.OperationalError:
+                database.close()
+                database = _connected(self._copied(), "mode=ro")
         except sqlite3.Error as error:
             raise DamageError(f"{self.path}: cannot be opened: {error}") from error
         return database
+
+    def _copied(self) -> Path:
+        """A copy of the file and its log in a folder that can be written to; made once."""
+        if self._copy is not None:
+            return Path(self._copy.name) / self.path.name
+        folder = TemporaryDirectory(prefix="engram-bag-")
+        copy = Path(folder.name) / self.path.name
+        try:
+            for source, target in ((self.path, copy), (_log_of(self.path), _log_of(copy))):
+                with os.fdopen(open_regular(source), "rb") as read, target.open("xb") as written:
+                    shutil.copyfileobj(read, written)
+        except OSError as error:
+            folder.cleanup()
+            raise DamageError(
+                f"{self.path}: its last messages lie in {_log_of(self.path).name}, and cannot be "
+                f"copied to {folder.name} to be read: {error.strerror}; copy both files to a "
+                "folder that can be written to"
+            ) from error
+        self._copy = folder
+        return copy
 
     def _named(self, database: sqlite3.Connection) -> dict[int, Topic]:
         tables = {
@@ -98,14 +124,15 @@ class DatabaseBag:
         if tables != {"topics", "messages"}:
             raise DamageError(f"{self.path}: is an SQLite file, but not a ROS 2 bag")
         rows = list(database.execute("SELECT id, name, type, serialization_format FROM topics"))
-        formats = {str(row[3]) for row in rows} - {"cdr"}
-        if formats:
+        formats = {str(row[3]) for row in rows}
+        if formats and "cdr" not in formats:
             raise DamageError(
                 f"{self.path}: messages are serialised as {', '.join(sorted(formats))}; only cdr "
                 "is read"
             )
         return {
-            int(number): Topic(str(name), message_type(str(kind))) for number, name, kind, _ in rows
+            int(number): topic_of(str(name), message_type(str(kind)), str(form), "cdr")
+            for number, name, kind, form in rows
         }
 
     def _rows(
@@ -144,3 +171,17 @@ class DatabaseBag:
                 lost(f"{self.path}: row {row} is lost: {error}")
                 return None
         return Record(topic, stamp_ns, data)
+
+
+def _log_of(path: Path) -> Path:
+    """The write-ahead log of a database."""
+    return path.with_name(path.name + "-wal")
+
+
+def _connected(path: Path, mode: str) -> sqlite3.Connection:
+    database = sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True)
+    database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BYTES)
+    database.execute("PRAGMA trusted_schema = OFF")
+    # The file is open for reading only; this lets SQLite read one that was cut short.
+    database.execute("PRAGMA writable_schema = ON")
+    return database

@@ -12,7 +12,7 @@ import numpy as np
 
 from engram.errors import InputError
 from engram.sequences.bags.bag import Bag, files_of
-from engram.sequences.bags.calibrating import Transforms, read_transforms
+from engram.sequences.bags.calibrating import read_transforms
 from engram.sequences.bags.messages import Decoder
 from engram.sequences.bags.motion import IMU, ODOMETRY, TWIST
 from engram.sequences.bags.sequence import BagSequence
@@ -62,6 +62,7 @@ class BagFacts:
         mounting: frame of the robot that the camera's mounting refers to, or "calibration" if
             the given one states it; None if unknown.
         command: the command that maps the bag.
+        notes: what was read otherwise than it is written.
         lost: what could not be read.
     """
 
@@ -78,6 +79,7 @@ class BagFacts:
     calibration: str
     mounting: str | None
     command: str
+    notes: list[str]
     lost: list[str]
 
 
@@ -95,7 +97,7 @@ def describe_bag(path: Path, options: OpenOptions | None = None) -> BagFacts:
     options = options or OpenOptions()
     bag = Bag(path)
     topics, start_ns, end_ns = _topics(bag)
-    transforms = read_transforms(bag, Decoder(bag.is_ros1))
+    static = read_transforms(bag, Decoder(bag.is_ros1))
     drive, question = _opened(path, options)
     left = None if drive is None else drive.topics.left
     return BagFacts(
@@ -105,13 +107,14 @@ def describe_bag(path: Path, options: OpenOptions | None = None) -> BagFacts:
         start_ns,
         (end_ns - start_ns) / 1e9,
         topics,
-        [f"{parent} → {child}" for child, (parent, _) in sorted(transforms.parents.items())],
+        [f"{parent} → {child}" for child, (parent, _) in sorted(static.parents.items())],
         left,
         None if drive is None else drive.topics.right,
         question,
         "" if drive is None else _calibration(drive),
-        _mounting(drive, transforms),
+        _mounting(drive),
         _command(path, options, topics, drive, question),
+        [] if drive is None else drive.notes,
         bag.lost,
     )
 
@@ -161,10 +164,10 @@ def _calibration(drive: BagSequence) -> str:
     )
 
 
-def _mounting(drive: BagSequence | None, transforms: Transforms) -> str | None:
+def _mounting(drive: BagSequence | None) -> str | None:
     if drive is None or drive.camera.cam_from_rig is None:
         return None
-    return transforms.base_of(drive.frame) or "calibration"
+    return drive.transforms.base_of(drive.frame) or "calibration"
 
 
 def _command(
@@ -178,7 +181,7 @@ def _command(
 
     Empty if no option helps.
     """
-    asks = "name them" in question or "choose one" in question
+    asks = any(words in question for words in ("name them", "choose one", "name the topic twice"))
     if drive is None and not asks and "--calibration FILE" not in question:
         return ""
     motion = [

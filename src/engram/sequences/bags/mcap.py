@@ -1,4 +1,4 @@
-"""MCAP files of ROS 2, from front to back.
+"""MCAP files of ROS 2, or converted from ROS 1, from front to back.
 
 Source: mcap.dev, "MCAP format specification": records of an opcode, a length and content; chunks
 hold schemas, channels and messages; a summary may follow.
@@ -23,6 +23,7 @@ from engram.sequences.bags.records import (
     Topic,
     counted,
     message_type,
+    topic_of,
 )
 from engram.untrusted import open_regular
 
@@ -37,7 +38,7 @@ class _Contents:
     def __init__(self) -> None:
         self.schemas: dict[int, str] = {}
         self.channels: dict[int, Topic] = {}
-        self.encodings: set[str] = set()
+        self.encodings: dict[int, str] = {}
         self.counts: dict[int, int] | None = None
 
     def note(self, code: int, content: bytes) -> None:
@@ -49,17 +50,23 @@ class _Contents:
         elif code == _CHANNEL:
             number, schema = parts.number("<H"), parts.number("<H")
             name = parts.text()
-            self.encodings.add(parts.text())
+            self.encodings[number] = parts.text()
             self.channels[number] = Topic(name, self.schemas.get(schema, "unknown"))
         elif code == _STATISTICS:
             parts.skip(42)
             table = parts.sized("<I")
             self.counts = dict(struct.iter_unpack("<HQ", table[: len(table) // 10 * 10]))
 
-    @property
-    def topics(self) -> dict[str, Topic]:
-        """The topics by name; with counts if statistics were met."""
-        found = {topic.name: topic for topic in self.channels.values()}
+    def topics(self, encoding: str) -> dict[str, Topic]:
+        """The topics by name, with counts if statistics were met.
+
+        Args:
+            encoding: of the messages that are read.
+        """
+        found = {
+            topic.name: topic_of(topic.name, topic.type, self.encodings[number], encoding)
+            for number, topic in self.channels.items()
+        }
         if self.counts is None:
             return found
         counts: dict[str, int] = {}
@@ -69,12 +76,11 @@ class _Contents:
 
 
 class McapBag:
-    """A `BagFile` of ROS 2 in MCAP."""
-
-    is_ros1 = False
+    """A `BagFile` in MCAP, of ROS 2 or converted from ROS 1, which `topics` finds out."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.is_ros1 = False
 
     def topics(self, lost: Report) -> dict[str, Topic]:
         """The topics, from the summary, or if there is none from all chunks."""
@@ -84,12 +90,14 @@ class McapBag:
                 contents = _Contents()
                 for _ in self._scan(file, contents, set(), lost):
                     pass  # the scan fills the contents
-        if contents.encodings - {"cdr"}:
+        met = set(contents.encodings.values())
+        self.is_ros1 = "ros1" in met and "cdr" not in met
+        if met and not met & {"cdr", "ros1"}:
             raise DamageError(
-                f"{self.path}: messages are encoded as {', '.join(sorted(contents.encodings))}; "
-                "only ROS 2 (cdr) is read"
+                f"{self.path}: messages are encoded as {', '.join(sorted(met))}; only those of "
+                "ROS 2 (cdr) and ROS 1 (ros1) are read"
             )
-        return contents.topics
+        return contents.topics("ros1" if self.is_ros1 else "cdr")
 
     def records(self, topics: Collection[str] | None, lost: Report) -> Iterator[Record]:
         """The messages in the order of the file; see `BagFile`."""

@@ -31,12 +31,22 @@ def _luma(first: int) -> Callable[[Pixels], Pixels]:
     return lambda image: image[:, :, first]
 
 
+# Planar YUV: the first plane is the grey image. Rows of colour that follow, per row of the image.
+_CHROMA_ROWS: Mapping[str, float] = MappingProxyType(
+    {
+        **dict.fromkeys(("nv12", "nv21", "i420", "iyuv", "yv12", "yuv420", "yuv420p"), 0.5),
+        **dict.fromkeys(("nv16", "nv61", "yuv422p"), 1.0),
+        **dict.fromkeys(("nv24", "nv42", "yuv444p"), 2.0),
+    }
+)
+
 # Encoding → type of a value, values per pixel, and how OpenCV's grey or BGR follows.
 # Source: sensor_msgs/image_encodings.hpp.
 _ENCODINGS: Mapping[str, tuple[str, int, Callable[[Pixels], Pixels]]] = MappingProxyType(
     {
-        **dict.fromkeys(("mono8", "8uc1"), ("u1", 1, _as_it_is)),
-        **dict.fromkeys(("mono16", "16uc1"), ("u2", 1, _as_it_is)),
+        **dict.fromkeys(("mono8", "8uc1", "y8", "grey8", "gray8"), ("u1", 1, _as_it_is)),
+        **dict.fromkeys(("mono16", "16uc1", "y16", "y10", "y12"), ("u2", 1, _as_it_is)),
+        **dict.fromkeys(("mono10", "mono12", "mono14"), ("u2", 1, _as_it_is)),
         **dict.fromkeys(("bgr8", "8uc3"), ("u1", 3, _as_it_is)),
         **dict.fromkeys(("bgra8", "8uc4"), ("u1", 4, _as_it_is)),
         "rgb8": ("u1", 3, lambda image: image[:, :, ::-1]),
@@ -44,7 +54,8 @@ _ENCODINGS: Mapping[str, tuple[str, int, Callable[[Pixels], Pixels]]] = MappingP
         "bgr16": ("u2", 3, _as_it_is),
         "rgb16": ("u2", 3, lambda image: image[:, :, ::-1]),
         **{name: ("u1", 2, _luma(1)) for name in ("yuv422", "uyvy")},
-        **{name: ("u1", 2, _luma(0)) for name in ("yuv422_yuy2", "yuyv")},
+        **{name: ("u1", 2, _luma(0)) for name in ("yuv422_yuy2", "yuyv", "yuy2", "yvyu")},
+        **dict.fromkeys(_CHROMA_ROWS, ("u1", 1, _as_it_is)),
         **{
             f"bayer_{ours}{bits}": (f"u{bits // 8}", 1, _bayer(code))
             for bits in (8, 16)
@@ -117,7 +128,22 @@ def size_of(message: Any, where: str) -> tuple[int, int]:
     if hasattr(message, "format"):
         height, width = decoded(where, bytes(message.data)).shape[:2]
         return width, height
-    return int(message.width), int(message.height)
+    return int(message.width), _rows_of(message)[0]
+
+
+def _rows_of(message: Any) -> tuple[int, int]:
+    """Number of rows of a raw image, and bytes from one to the next.
+
+    Of planar YUV some drivers state all bytes of a pixel in the step, or the rows of the colours in
+    the height.
+    """
+    width, height, step = int(message.width), int(message.height), int(message.step)
+    whole = 1 + _CHROMA_ROWS.get(str(message.encoding).strip().lower(), 0.0)
+    if whole == 1:
+        return height, step
+    step = width if step == round(whole * width) else step
+    all_rows = len(message.data) < step * height * whole
+    return (round(height / whole) if all_rows else height), step
 
 
 def _pixels(message: Any, where: str, size: tuple[int, int] | None) -> Pixels:
@@ -131,7 +157,10 @@ def _pixels(message: Any, where: str, size: tuple[int, int] | None) -> Pixels:
     encoding = str(message.encoding).strip().lower()
     if encoding not in _ENCODINGS:
         known = ", ".join(_ENCODINGS)
-        raise SequenceError(f"{where}: encoding is {encoding[:40]!r}; known are {known}")
+        raise SequenceError(
+            f"{where}: encoding is {encoding[:40]!r}; known are {known}; set the camera's driver to "
+            "one of them"
+        )
     kind, values, to_bgr = _ENCODINGS[encoding]
     image = to_bgr(_array(message, where, np.dtype(kind), values, size))
     return np.ascontiguousarray(image)
@@ -141,7 +170,7 @@ def _array(
     message: Any, where: str, kind: np.dtype[Any], values: int, size: tuple[int, int] | None
 ) -> Pixels:
     """The (h, w, values) array of a raw image, or (h, w) if it has one value a pixel."""
-    width, height, step = int(message.width), int(message.height), int(message.step)
+    width, (height, step) = int(message.width), _rows_of(message)
     check_not_huge(where, (width, height))
     if size is not None and (width, height) != size:
         raise SequenceError(

@@ -90,6 +90,11 @@ def message_type(name: str) -> str:
     return f"{package.removesuffix('/msg')}/msg/{kind}" if package else name
 
 
+def topic_of(name: str, kind: str, encoding: str, read: str) -> Topic:
+    """A topic; the type of one whose messages are not encoded as those that are read says so."""
+    return Topic(name, kind if encoding == read else f"{kind} in {encoding or 'no encoding'}")
+
+
 def counted(topics: dict[str, Topic], counts: dict[str, int]) -> dict[str, Topic]:
     """The topics with the number of their messages."""
     return {name: Topic(name, topic.type, counts.get(name, 0)) for name, topic in topics.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.calibration import Cameras, read_calibration
+from engram.counts import counted
 from engram.errors import CalibrationError, SequenceError
 from engram.frontend import StereoPair
 from engram.geometry import StereoCamera
@@ -24,6 +26,7 @@ from engram.sequences.bags.calibrating import (
     read_cameras,
     read_infos,
     read_transforms,
+    with_constant,
 )
 from engram.sequences.bags.fixes import Fix, fix_topics, fixes_of
 from engram.sequences.bags.messages import Decoder, stamp_of
@@ -31,10 +34,10 @@ from engram.sequences.bags.motion import BagMotion
 from engram.sequences.bags.pairing import Pairing, Shot, learnt_tolerance, pairs_of
 from engram.sequences.bags.pictures import depth_of, grey_of, size_of
 from engram.sequences.bags.records import DamageError
-from engram.sequences.bags.topics import StereoTopics, stereo_topics
-from engram.sequences.calibrating import check_no_view, read_mask
+from engram.sequences.bags.topics import StereoTopics, only_topic, same_images, stereo_topics
+from engram.sequences.calibrating import TELLING, check_no_view, check_sides, read_mask
 from engram.sequences.euroc import YEAR_2000_NS
-from engram.sequences.image_sequence import rectified, with_options
+from engram.sequences.image_sequence import Side, half, rectified, with_options
 from engram.sequences.options import OpenOptions
 from engram.sequences.sequence import SequenceInfo
 
@@ -43,6 +46,7 @@ _LEARNT_FROM = 100
 # Images of either side that tell how many of 16 bits the cameras use.
 _BITS_FROM = 10
 _MOST_REASONS = 20
+_PLACE = re.compile(r": image \d+:? ")
 
 
 def open_bag(path: Path, options: OpenOptions) -> BagSequence:
@@ -61,6 +65,7 @@ class BagSequence:
         cameras: its stereo pair, with the rectification of raw images.
         camera: its one camera, rectified.
         topics: where the images come from.
+        transforms: the constant transforms that were found.
         pairing: what became of the images, in the latest pass.
 
     Raises:
@@ -80,8 +85,10 @@ class BagSequence:
             given = self._given(options, rectified=True)
         tolerance_ns, self._first_ns = self._learn()
         self.pairing = Pairing(tolerance_ns)
-        transforms = read_transforms(self._bag, self._decoder)
+        self._static = read_transforms(self._bag, self._decoder)
+        transforms = with_constant(self._static, self._bag, self._decoder, self.frame)
         self.cameras = mounted(given or self._calibrated(options), mounting(transforms, self.frame))
+        self.transforms = transforms
         self.camera: StereoCamera = self.cameras.camera
         check_no_view(options, self.cameras)
         self._mask = None if options.mask is None else read_mask(options.mask, self.cameras)
@@ -96,8 +103,13 @@ class BagSequence:
             transforms,
             self.camera.cam_from_rig,
         )
-        self._reasons: list[str] = []
+        self._reasons: dict[str, list[str]] = {}
         self._bits = self._depth()
+        if self.cameras.sides_doubtful:
+            telling = islice(self, TELLING.start, TELLING.stop, TELLING.step)
+            check_sides(self.cameras, telling, path)
+            self.pairing = Pairing(tolerance_ns)
+            self._reasons.clear()
 
     def motion(self) -> MotionSource | None:
         """A new pass through the motion by wheels or gyroscope; None without one."""
@@ -136,13 +148,27 @@ class BagSequence:
 
     @property
     def skipped_reasons(self) -> list[str]:
-        """Why; the first of them."""
-        return list(self._reasons)
+        """Why, once for each reason, with the number of images."""
+        return [_summed(faults) for faults in self._reasons.values()]
 
     @property
     def lost(self) -> list[str]:
         """What of the bag could not be read, in all passes; empty for a sound one."""
-        return [*self._bag.lost, *self._reasons]
+        return [*self._bag.lost, *self.skipped_reasons]
+
+    @property
+    def notes(self) -> list[str]:
+        """What of calibration and mounting was read otherwise than it is written."""
+        notes, frame = list(self.cameras.notes), self.frame
+        base, moving = self.transforms.base_of(frame), self.transforms.turning(frame)
+        if self.camera.cam_from_rig is None and moving is not None:
+            notes.append(
+                f"the mounting is unknown: /tf moves {moving} during the drive, and with it the "
+                "camera; hold it still, or state cam_from_rig in a --calibration FILE"
+            )
+        elif base is not None and self._static.base_of(frame) is None:
+            notes.append(f"the mounting on {base} is that of /tf, which is constant there")
+        return notes
 
     def __len__(self) -> int:
         """Number of pairs, at most: how many are of one instant is known after reading."""
@@ -176,7 +202,7 @@ class BagSequence:
                 used += 1
                 yield pair
         if not used:
-            why = f"; first fault: {self._reasons[0]}" if self._reasons else ""
+            why = f"; {self.skipped_reasons[0]}" if self._reasons else ""
             raise SequenceError(
                 f"{self._bag.path}: no pair can be used of {self.pairing.left} left and "
                 f"{self.pairing.right} right images{why}"
@@ -186,22 +212,26 @@ class BagSequence:
         """The pair; None if an image of it is damaged or does not fit."""
         table = self.cameras.rectification
         try:
-            image = self._image(self.topics.left, left, table and table.left)
-            other = self._image(self.topics.right, right, table and table.right)
+            image = self._image(self.topics.left, left, Side.LEFT, table and table.left)
+            other = self._image(self.topics.right, right, Side.RIGHT, table and table.right)
         except SequenceError as error:
             self.pairing.unusable += 1
             self.pairing.paired -= 1
-            if len(self._reasons) < _MOST_REASONS:
-                self._reasons.append(str(error))
+            reason = _PLACE.sub(": ", str(error), count=1)
+            if reason in self._reasons or len(self._reasons) < _MOST_REASONS:
+                self._reasons.setdefault(reason, []).append(str(error))
             return None
         return StereoPair(left.stamp_ns + self._shift_ns, image, other, self.camera, self._mask)
 
-    def _image(self, topic: str, shot: Shot[Any], table: Any) -> NDArray[np.uint8]:
+    def _image(self, topic: str, shot: Shot[Any], side: Side, table: Any) -> NDArray[np.uint8]:
         where = f"{topic}: image {shot.number}"
         if isinstance(shot.content, str):
             raise SequenceError(f"{where} {shot.content}")
-        size = (self.camera.width, self.camera.height)
+        halves = self.topics.are_halves
+        size = (self.camera.width * (1 + halves), self.camera.height)
         image = grey_of(shot.content, where, size, self._options.channel, self._bits)
+        if halves:
+            image = half(image, side)
         return image if table is None else rectified(image, table)
 
     def _shots(self, topic: str) -> Iterator[Shot[Any]]:
@@ -255,13 +285,25 @@ class BagSequence:
     def _stereo_topics(self, given: Cameras | None) -> StereoTopics:
         left, right = self._options.left, self._options.right
         stated = given.topics if given is not None else None
-        if left is None and right is None and stated and set(stated) <= self._bag.topics.keys():
-            left, right = stated
+        alone = left is None and right is None
+        if alone and stated:
+            there = [same_images(name, self._bag.topics) for name in stated]
+            if None not in there:
+                left, right = there
+                alone = False
         try:
             raw = given is not None and given.rectification is not None
-            return stereo_topics(self._bag.topics, left, right, prefer_raw=raw)
+            found = stereo_topics(self._bag.topics, left, right, prefer_raw=raw)
         except SequenceError as error:
-            raise SequenceError(f"{self._bag.path}: {error}") from error
+            only = only_topic(self._bag.topics) if alone else None
+            size = (0, 0) if only is None else self._first_size(only)
+            if only is not None and given is not None and _are_two(size, given.camera):
+                return StereoTopics(only, only)
+            advice = "" if size[0] < 2 * size[1] or only is None else _as_halves(only, size)
+            raise SequenceError(f"{self._bag.path}: {error}{advice}") from error
+        if alone and given is not None and given.right_first and found.are_numbered:
+            return found.exchanged()  # cam0 is the calibration's cam0
+        return found
 
     def _given(self, options: OpenOptions, *, rectified: bool = False) -> Cameras:
         assert options.calibration is not None
@@ -288,7 +330,11 @@ class BagSequence:
         Raises:
             SequenceError: there is none.
         """
-        left = self._stereo_topics(None).left
+        topics = self._stereo_topics(None)
+        width, height = self._first_size(topics.left)
+        return (width // 2, height) if topics.are_halves else (width, height)
+
+    def _first_size(self, left: str) -> tuple[int, int]:
         fault = "no image can be read"
         for shot in islice(self._shots(left), _LEARNT_FROM):
             if isinstance(shot.content, str):
@@ -299,6 +345,26 @@ class BagSequence:
             except SequenceError as error:
                 fault = str(error)
         raise SequenceError(f"{self._bag.path}: {left}: {fault}")
+
+
+def _are_two(size: tuple[int, int], camera: StereoCamera) -> bool:
+    """Whether an image of this size holds two of a camera's side by side."""
+    return size == (2 * camera.width, camera.height)
+
+
+def _as_halves(topic: str, size: tuple[int, int]) -> str:
+    """How a topic of wide images is read, if they hold both sides."""
+    return (
+        f"\nif each image holds left and right side by side, {size[0] // 2}×{size[1]} px each, "
+        f"name the topic twice: --left {topic} --right {topic} --calibration FILE, which is the "
+        "calibration of the halves"
+    )
+
+
+def _summed(faults: list[str]) -> str:
+    """One reason for which images were left out, and how many they were."""
+    more = len(faults) - 1
+    return faults[0] if not more else f"{faults[0]} (and {counted(more, 'image')} more)"
 
 
 def _frame(message: Any) -> str:
