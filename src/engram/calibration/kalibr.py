@@ -55,7 +55,7 @@ def _lens(side: dict[str, Any]) -> RawCamera:
     if model != "pinhole":
         raise CalibrationError(
             f"camera_model is {model[:40]!r}, only 'pinhole' is supported; calibrate again with "
-            "--models pinhole-radtan, or pinhole-equi for a wide lens"
+            "Kalibr's models pinhole-radtan, or pinhole-equi for a wide lens"
         )
     fx, fy, cx, cy = numbers(side, "intrinsics", {4})
     width, height = (whole(value) for value in numbers(side, "resolution", {2}))

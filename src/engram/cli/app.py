@@ -20,7 +20,6 @@ app = typer.Typer(
     name="engram",
     cls=Program,
     help="Lifelong visual localisation for fleets of robots with stereo cameras.",
-    epilog="Start with: engram map street.engram DRIVE, or engram demo",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -47,6 +46,9 @@ def _program(
 
 
 register(app)
+# The demonstration comes with the laboratory.
+_DEMO = ", or engram demo" if any(one.name == "demo" for one in app.registered_commands) else ""
+app.info.epilog = f"Start with: engram map street.engram DRIVE{_DEMO}"
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130

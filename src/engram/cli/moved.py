@@ -55,7 +55,7 @@ GONE = {
     "map": {"--deadline": "a map made against the clock is different every time; use --rounds"},
     "localise": {
         "--every": "--pictures spreads about 20 pictures over the drive",
-        "--preload": "images are decoded ahead; time stages with engram lab bench",
+        "--preload": "images are decoded ahead; engram lab bench, of engram-lab, times stages",
     },
     **dict.fromkeys(("merge", "build", "tag", "revert", "vocabulary"), _AUTHOR),
 }

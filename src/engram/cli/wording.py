@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -59,7 +60,9 @@ def localised_text(
         + (f"; {counted(summary['late_frames'], 'frame')} late" if summary["late_frames"] else ""),
         *_stages(summary["stages_ms"]),
     ]
-    return _lines(*lines, f"next: {_after_localising(frames, map_path)}")
+    if not summary["statuses"].get("localised", 0) and summary["statuses"].get("lost", 0):
+        lines.append("  nothing in this drive looks like the map: is it of the same place?")
+    return _lines(*lines, f"next: {_after_localising(summary, frames, map_path)}")
 
 
 def undo_text(map_path: Path | str, *revisions: int) -> str:
@@ -120,11 +123,28 @@ def _stages(stages_ms: Mapping[str, Mapping[str, float]]) -> list[str]:
 def _after_mapping(report: Mapping[str, Any], map_path: Path | str) -> str:
     if any(one["severity"] == "fatal" for one in report["findings"]):
         return f"correct the drive, then engram revert {typed(map_path)} {report['revision']}"
-    path = typed(map_path)
-    return f"engram localise {path} ANOTHER_DRIVE, or engram plot {path} map.png"
+    return f"engram localise {typed(map_path)} ANOTHER_DRIVE, or {_shown(map_path)}"
 
 
-def _after_localising(frames: Sequence[Mapping[str, Any]], map_path: Path | str) -> str:
+def _shown(map_path: Path | str) -> str:
+    """The command that shows a map: a picture, where what draws it is installed."""
+    if find_spec("matplotlib") is None:
+        return f"engram info {typed(map_path)}"
+    return f"engram plot {typed(map_path)} map.png"
+
+
+def _after_localising(
+    summary: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], map_path: Path | str
+) -> str:
+    fatal = [one["code"] for one in summary["findings"] if one["severity"] == "fatal"]
+    if fatal:
+        return f"correct the drive ({', '.join(fatal)}, see the warnings), then localise it again"
+    statuses = summary["statuses"]
+    if statuses.get("lost", 0) and not statuses.get("localised", 0):
+        return (
+            "if it is the same place in other light or weather, map it, too: engram map "
+            f"{typed(map_path)} DRIVE"
+        )
     missed = [
         number
         for number, frame in enumerate(frames)
@@ -132,4 +152,4 @@ def _after_localising(frames: Sequence[Mapping[str, Any]], map_path: Path | str)
     ]
     if missed:
         return f"engram localise {typed(map_path)} DRIVE --explain {missed[len(missed) // 2]}"
-    return f"engram plot {typed(map_path)} map.png"
+    return _shown(map_path)

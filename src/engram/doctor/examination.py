@@ -88,6 +88,7 @@ class Evidence:
             before.
         bad: why other pairs were left out: an image is missing, unreadable or of another size.
         outside: each step as measured by wheels or another source; None where it was not.
+        turned_rad: how far each step turned by gyroscope or wheels; None where it was not measured.
         rematched: how frames fit a map by other calibrations; of none without a map.
         alignments: of some pairs, worked out once at the end; None before.
     """
@@ -109,6 +110,7 @@ class Evidence:
     repeated: int = 0
     bad: list[str] = field(default_factory=list)
     outside: list[SE3 | None] = field(default_factory=list)
+    turned_rad: list[float | None] = field(default_factory=list)
     rematched: Rematched = field(default_factory=Rematched)
     alignments: list[Alignment] | None = None
 
@@ -157,6 +159,7 @@ class Examination:
         frame: Frame,
         motion: Motion,
         outside: SE3 | None = None,
+        turned_rad: float | None = None,
     ) -> None:
         """Looks at one frame.
 
@@ -165,6 +168,7 @@ class Examination:
             frame: what the front-end made of it.
             motion: the motion that led to it.
             outside: the same as measured by wheels or another source; None if it was not.
+            turned_rad: how far it turned by gyroscope or wheels; None if that was not measured.
         """
         if self.full:
             return
@@ -179,6 +183,7 @@ class Examination:
         way = np.zeros((3, 3)) if step.covariance is None else step.covariance[:3, :3]
         seen.sigma_m.append(float(np.sqrt(np.trace(way))))
         seen.outside.append(outside)
+        seen.turned_rad.append(turned_rad)
         disparity_px = frame.landmarks.disparity_px
         seen.disparity_px.append(float(np.median(disparity_px)) if len(disparity_px) else 0.0)
         self._begins = False

@@ -42,6 +42,7 @@ class DoctorConfig:
         least_disparity_px: median disparity of the landmarks, px: below it depth is a guess.
         scale: difference of odometry's scale from that of motion from outside, and of focal length
             or baseline from what fits a map, as a share.
+        turn_ratio: turn by gyroscope or wheels over that which odometry sees; degrees have 57.
         bits: bits of the brightest pixel of 16-bit images.
         other_size: distance of the principal point from the middle, both down and right, or both
             up and left, in half images. Real calibrations stay below 0.1; half images with the
@@ -71,6 +72,7 @@ class DoctorConfig:
     least_px_per_deg: Annotated[float, Meta(gt=0)] = 4.0
     least_disparity_px: Annotated[float, Meta(gt=0)] = 2.0
     scale: Annotated[float, Meta(gt=0)] = 0.05
+    turn_ratio: Annotated[float, Meta(gt=1)] = 8.0
     bits: Annotated[int, Meta(ge=1, le=16)] = 14
     other_size: Annotated[float, Meta(gt=0)] = 0.25
 

@@ -22,6 +22,7 @@ class Check:
         unit: of the value.
         message: what is wrong beyond the limit, in words.
         cure: what to do then.
+        advice: the same in the light of what was seen; None where that tells no more.
         example: one of the things that are wrong, for the message.
         below: whether values below the limit are the alarm, not those above.
         needs: what it would take to tell, for the report; "" if nobody need know.
@@ -35,6 +36,7 @@ class Check:
     unit: str
     message: str
     cure: str
+    advice: Callable[[Evidence], str] | None = None
     example: Callable[[Evidence], str] | None = None
     below: bool = False
     needs: str = ""
@@ -47,7 +49,8 @@ class Check:
         if value is None or not (value < limit if self.below else value > limit):
             return value
         message = self.message + (f", such as: {self.example(seen)}" if self.example else "")
-        return Finding(self.code, self.severity, message, value, float(limit), self.unit, self.cure)
+        cure = self.cure if self.advice is None else self.advice(seen)
+        return Finding(self.code, self.severity, message, value, float(limit), self.unit, cure)
 
 
 _FATAL, _WARNING, _NOTE = Severity
@@ -69,7 +72,8 @@ CHECKS: tuple[Check, ...] = (
     Check(
         "sides_swapped", _FATAL, sides.swapped, "negative_share", "of the matches",
         "left and right are swapped: near things lie further right in the right image",
-        "exchange the two folders or topics, and the two halves of a raw calibration",
+        "exchange the two folders, or topics (--left, --right), and the two halves of a raw "
+        "calibration",
         explains=_CONSEQUENCES,
     ),
     Check(
@@ -135,6 +139,12 @@ CHECKS: tuple[Check, ...] = (
         needs="motion from outside, --motion TOPIC or FILE, and odometry that is sure of its steps",
     ),
     Check(
+        "turns_in_degrees", _WARNING, motion.turn_ratio, "turn_ratio", "times what odometry sees",
+        "gyroscope or wheels turn much further than the images: in degrees, it seems; they are "
+        "left aside",
+        "give --motion in radians per second: degrees divided by 57.3",
+    ),
+    Check(
         "focal_length_off", _WARNING, optics.focal_too_long, "scale", "of the right one",
         "the focal length is too long: with another one images fit the map better; positions "
         "are off by metres",
@@ -190,7 +200,7 @@ CHECKS: tuple[Check, ...] = (
     Check(
         "low_frame_rate", _WARNING, stamps.rate_hz, "least_rate_hz", "Hz",
         "few frames per second: odometry has no prediction from one to the next",
-        "record with at least 4 Hz, better 10",
+        "record with at least 4 Hz, better 10; or are the stamps in milliseconds, not seconds?",
         below=True,
     ),
     Check(
@@ -254,12 +264,14 @@ CHECKS: tuple[Check, ...] = (
         "clock_unknown", _WARNING, stamps.hours_needed, 0, "of 2 unknown",
         "missions by hour need a UTC clock and a zone or longitude",
         "give --recorded-at, and --zone or --longitude",
+        stamps.hour_given_by,
         explains=("clock_unstated",),
     ),
     Check(
         "clock_unstated", _NOTE, stamps.hours_unknown, 0, "of 2 unknown",
         "the hour of the drive is unknown",
         "for downloads by hour give --recorded-at, and --zone or --longitude",
+        lambda seen: f"for downloads by hour {stamps.hour_given_by(seen)}",
     ),
 )  # fmt: skip
 

@@ -81,6 +81,13 @@ class OutsideMotion:
     has_way: bool = True
     rates_rad_s: NDArray[np.float64] | None = None
 
+    @property
+    def turned_rad(self) -> float:
+        """How far the camera turned about any axis; by the gyroscope perhaps more than once."""
+        if self.rates_rad_s is None:
+            return self.prev_from_curr.angle_rad
+        return float(np.linalg.norm(self.rates_rad_s)) * self.seconds
+
 
 class MotionSource(Protocol):
     """Gives the motion between two frames, in the order of time."""

@@ -65,7 +65,7 @@ def check_for_robot(name: str) -> None:
     if looks_ahead(policy_named(name)):
         raise ConfigError(
             f"the policy {name} looks ahead, which only an evaluation can do; use it in "
-            "engram lab evaluate, and another policy for a drive"
+            "engram lab evaluate of engram-lab, and another policy for a drive"
         )
 
 

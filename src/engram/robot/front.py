@@ -145,13 +145,15 @@ class Front:
         self, arrived: Arrived, motion: Motion | OutsideMotion | None, clock: StageClock
     ) -> tuple[Frame, Motion]:
         told: SE3 | None = None
+        turned_rad: float | None = None
         if not isinstance(motion, Motion):
             self._outside.add(motion)
             told = motion.prev_from_curr if motion is not None and motion.has_way else None
+            turned_rad = None if motion is None else motion.turned_rad
         if isinstance(arrived, LoggedFrame):
             if not isinstance(motion, Motion):
                 motion = self._moved(arrived.odometry, arrived.frame.stamp_ns)
-            self.examination.see(arrived, arrived.frame, motion, told)
+            self.examination.see(arrived, arrived.frame, motion, told, turned_rad)
             return arrived.frame, motion
         frame = self._frontend.extract(arrived)
         if self._frozen.repeats(arrived):
@@ -162,7 +164,7 @@ class Front:
             motion = self._moved(step, frame.stamp_ns)
             clock.lap("odometry")
         self._frozen.note(motion)
-        self.examination.see(arrived, frame, motion, told)
+        self.examination.see(arrived, frame, motion, told, turned_rad)
         clock.lap("doctor")
         return frame, motion
 

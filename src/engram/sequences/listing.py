@@ -241,10 +241,10 @@ def usable_pairs(
     """
     chosen = choose(places)
     reasons = [place for place in chosen if isinstance(place, str)]
-    if reasons and not skip_bad:
+    pairs = [place for place in chosen if isinstance(place, PairFiles)]
+    if reasons and pairs and not skip_bad:
         more = f" (and {len(reasons) - 1} more such faults)" if len(reasons) > 1 else ""
         raise SequenceError(f"{reasons[0]}{more}; leave them out with --skip-bad")
-    pairs = [place for place in chosen if isinstance(place, PairFiles)]
     if not pairs:
         if places and not chosen:
             raise SequenceError(

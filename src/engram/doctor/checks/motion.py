@@ -15,6 +15,8 @@ _MOVING_M = 0.02
 _CONTRAST = 4.0
 # So many equal pairs are no robot at rest before a camera without noise.
 _LONG = 30
+# Steps that turn by more than odometry's noise.
+_TURNING_RAD = math.radians(0.3)
 # Ways are compared over stretches of this length, metres, and at least so many of them.
 _WAY_M = 2.0
 _LEAST_WAYS = 3
@@ -83,6 +85,19 @@ def scale_off(seen: Evidence) -> float | None:
     spread = _OF_MEDIAN * float(np.median(np.abs(ratios - ratio))) / math.sqrt(len(ways))
     unsure, off = max(_SIGNIFICANT * spread, _COMMON * sigma), abs(ratio - 1)
     return off if max(off, seen.config.scale) > unsure else None
+
+
+def turn_ratio(seen: Evidence) -> float | None:
+    """The turn by gyroscope or wheels over that which odometry sees; the median where it turns.
+
+    Axes do not matter to it, so that a mounting that is not known does no harm.
+    """
+    ratios = [
+        turned_rad / step.angle_rad
+        for step, turned_rad in zip(seen.moved, seen.turned_rad, strict=True)
+        if step is not None and turned_rad is not None and step.angle_rad > _TURNING_RAD
+    ]
+    return float(np.median(ratios)) if len(ratios) >= seen.config.least_frames else None
 
 
 def _repeats(look: Look, side: int) -> bool:

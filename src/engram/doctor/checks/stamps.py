@@ -66,6 +66,14 @@ def hours_unknown(seen: Evidence) -> float | None:
     return float((facts.clock is not Clock.UTC) + nowhere)
 
 
+def hour_given_by(seen: Evidence) -> str:
+    """What makes the hour of the drive known."""
+    facts = seen.facts
+    nowhere = facts.zone is None and facts.longitude_deg is None
+    asked = ["--recorded-at"] if facts.clock is not Clock.UTC else []
+    return "give " + " and ".join(asked + ["--zone or --longitude"] * nowhere)
+
+
 def hours_needed(seen: Evidence) -> float | None:
     """The same, where missions by hour need it."""
     return hours_unknown(seen) if seen.facts.by_hour else None

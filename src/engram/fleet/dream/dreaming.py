@@ -192,7 +192,9 @@ def dream(
 
 def _check(centre: Path, handed: Sequence[Path], drives: Sequence[Path]) -> None:
     if not handed:
-        raise InputError(f"{centre}: nothing was handed in; merge with --keep, or name maps")
+        raise InputError(
+            f"{centre}: nothing was handed in; merge with engram merge --keep, or name maps"
+        )
     if len(drives) < FEWEST_DRIVES:
         raise ConfigError(
             f"{len(drives)} validation drives are too few to rule out chance: give at least "

@@ -158,8 +158,8 @@ def _pixels(message: Any, where: str, size: tuple[int, int] | None) -> Pixels:
     if encoding not in _ENCODINGS:
         known = ", ".join(_ENCODINGS)
         raise SequenceError(
-            f"{where}: encoding is {encoding[:40]!r}; known are {known}; set the camera's driver to "
-            "one of them"
+            f"{where}: encoding is {encoding[:40]!r}; known are {known}; set the camera's driver "
+            "to one of them"
         )
     kind, values, to_bgr = _ENCODINGS[encoding]
     image = to_bgr(_array(message, where, np.dtype(kind), values, size))

@@ -1,0 +1,217 @@
+"""What error texts tell people to type: every verb, option, setting and extra in them exists."""
+
+from __future__ import annotations
+
+import ast
+import re
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from engram.cli import moved, wording
+from engram.cli.app import app
+from engram.cli.settings import AllSettings, every_setting
+
+ROOT = Path(__file__).parents[2]
+SOURCE = ROOT / "src" / "engram"
+COMMANDS = typer.main.get_command(app).commands
+
+# `engram VERB`, not `import engram` or engram-lab; and the nouns that follow the name in prose.
+_VERB = re.compile(r"(?<![\w/.-])engram ([a-z]+)(?: ([a-z]+)\b)?")
+_PROSE = {"centre at", "token"}
+_OPTION = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
+_EXTRA = re.compile(r"engram-localisation\[(\w+)\]")
+_SETTING = re.compile(r"(?<![\w./-])([a-z_]+)\.([a-z_]+)(?![\w(/.])")
+# Parts of the program whose texts stand under some verbs; those of others under any.
+_OPENS_DRIVES = (
+    ("map",),
+    ("localise",),
+    ("record",),
+    ("doctor",),
+    ("view",),
+    ("drive", "info"),
+    ("drive", "calibration"),
+)
+_SPOKEN_BY: dict[str, tuple[tuple[str, ...], ...]] = {
+    "sequences/bags/fixes.py": (("anchor",),),
+    "sequences": _OPENS_DRIVES,
+    "calibration": _OPENS_DRIVES,
+    "doctor": (("map",), ("localise",), ("doctor",)),
+    "fleet/build": (("build",),),
+    "fleet/download": (("download",),),
+    "fleet/dream": (("dream",),),
+    "robot/anchoring.py": (("anchor",),),
+    "robot/exporting.py": (("export",),),
+}
+# The doctor leaves bad pairs out by itself, and maps nothing.
+_SPARED = {("doctor", "--skip-bad")}
+
+
+def texts() -> Iterator[tuple[str, int, str]]:
+    """File, line and text of every string that is no docstring; values as `{}`."""
+    for path in sorted(SOURCE.rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        passed = {
+            id(node.body[0].value)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
+            and node.body
+            and isinstance(node.body[0], ast.Expr)
+        }
+        for node in ast.walk(tree):
+            if isinstance(node, ast.JoinedStr):
+                passed |= {id(part) for part in node.values}
+                parts = (
+                    part.value if isinstance(part, ast.Constant) else "{}" for part in node.values
+                )
+                yield _place(path), node.lineno, "".join(map(str, parts))
+        for node in ast.walk(tree):
+            text = isinstance(node, ast.Constant) and isinstance(node.value, str)
+            if text and id(node) not in passed:
+                yield _place(path), node.lineno, node.value
+
+
+def _place(path: Path) -> str:
+    return path.relative_to(SOURCE).as_posix()
+
+
+TEXTS = [one for one in texts() if not one[0].startswith("centre/pages")]
+
+
+def command(words: tuple[str, ...]) -> Any:
+    """The command of these words; None if there is none."""
+    found: Any = COMMANDS.get(moved.SPELLINGS.get(words[0], words[0]))
+    for word in words[1:]:
+        found = getattr(found, "commands", {}).get(word)
+    return found
+
+
+def options_of(found: Any) -> set[str]:
+    taken = {one for each in found.params for one in (*each.opts, *each.secondary_opts)}
+    return taken | {"--help"}
+
+
+@cache
+def every_option() -> frozenset[str]:
+    """Those of every verb, the laboratory's included."""
+
+    def inside(commands: dict[str, Any]) -> Iterator[str]:
+        for found in commands.values():
+            yield from options_of(found)
+            yield from inside(getattr(found, "commands", {}))
+
+    return frozenset(inside(COMMANDS)) | {"--version"}
+
+
+def named_commands(text: str) -> Iterator[tuple[Any, str, str]]:
+    """Each command that a text names: what it is, its words, and the text until the next."""
+    ends = [*_VERB.finditer(text)]
+    for found, then in pairwise([*ends, None]):
+        assert found is not None
+        words = (found[1],) if found[2] is None else (found[1], found[2])
+        if " ".join(words) in _PROSE or found[1] in _PROSE:
+            continue
+        whole = command(words) if len(words) == 2 else None
+        head = command(words[:1])
+        inner = hasattr(head, "commands") and found[2] is not None
+        what = whole if inner else head
+        rest = text[found.end() : then.start() if then else len(text)]
+        yield what, " ".join(words if inner else words[:1]), rest
+
+
+def test_the_texts_are_found() -> None:
+    assert len(TEXTS) > 2000
+    assert sum(bool(_VERB.search(text)) for _, _, text in TEXTS) > 50
+
+
+def test_every_verb_that_a_text_names_exists() -> None:
+    wrong = [
+        f"{place}:{line}: engram {words}"
+        for place, line, text in TEXTS
+        for what, words, _ in named_commands(text)
+        if what is None
+    ]
+    assert wrong == []
+
+
+def test_every_option_behind_a_verb_is_one_of_it() -> None:
+    wrong = []
+    for place, line, text in TEXTS:
+        for what, words, rest in named_commands(text):
+            # What follows in another clause is said of the verb that speaks.
+            typed = re.split(r"[;,]|: | or ", rest)[0]
+            wrong += [
+                f"{place}:{line}: engram {words} {option}"
+                for option in _OPTION.findall(typed)
+                if what is not None and option not in options_of(what)
+            ]
+    assert wrong == []
+
+
+def test_every_option_is_one_of_the_verbs_that_speak() -> None:
+    wrong = []
+    for place, line, text in TEXTS:
+        if place == "cli/moved.py":
+            continue
+        verbs = next((_SPOKEN_BY[part] for part in _SPOKEN_BY if place.startswith(part)), ())
+        bare = _VERB.split(text)[0]
+        for option in _OPTION.findall(bare):
+            for words in verbs:
+                known = option in options_of(command(words)) or (words[0], option) in _SPARED
+                wrong += [] if known else [f"{place}:{line}: {' '.join(words)} {option}"]
+            if option not in every_option():
+                wrong.append(f"{place}:{line}: {option}")
+    assert wrong == []
+
+
+def test_every_extra_that_a_text_names_exists() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    named = {extra for _, _, text in TEXTS for extra in _EXTRA.findall(text)}
+    assert len(named) > 5
+    assert named <= project["optional-dependencies"].keys()
+
+
+def test_every_setting_that_a_text_names_exists() -> None:
+    known = {one.key for one in every_setting(AllSettings())}
+    tables = {key.split(".")[0] for key in known}
+    named = {
+        (place, f"{table}.{key}")
+        for place, _, text in TEXTS
+        for table, key in _SETTING.findall(text)
+        if table in tables and " " in text
+    }
+    assert len(named) > 3
+    assert {(place, key) for place, key in named if key not in known} == set()
+
+
+def test_what_the_laboratory_brings_is_named_as_its_own() -> None:
+    brought = {name for name in ("lab", "demo") if name in COMMANDS}
+    wrong = [
+        f"{place}:{line}: {text}"
+        for place, line, text in TEXTS
+        for found in _VERB.finditer(text)
+        if found[1] in {"lab", "demo"} and "engram-lab" not in text
+        # Both ask whether it is installed.
+        if place not in {"cli/moved.py", "cli/app.py"}
+    ]
+    assert wrong == []
+    assert ("engram demo" in app.info.epilog) == ("demo" in brought)
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_the_next_step_asks_for_nothing_that_is_not_installed(monkeypatch, drawn: bool) -> None:
+    monkeypatch.setattr(wording, "find_spec", lambda name: object() if drawn else None)
+    report = {
+        "known": False, "share_localised": 0.0, "nodes_saved": 3, "resumed": False, "revision": 1,
+        "interrupted": False, "findings": [], "statuses": {"lost": 3}, "frames": 3,
+        "skipped_pairs": 0,
+    }  # fmt: skip
+    told = wording.mapped_text(report, "town.engram").splitlines()[-1]
+    shown = "engram plot town.engram map.png" if drawn else "engram info town.engram"
+    assert told == f"next: engram localise town.engram ANOTHER_DRIVE, or {shown}"
