@@ -22,9 +22,10 @@ from engram.doctor import (
     Severity,
     diagnose,
 )
-from engram.doctor.checks.motion import scale_off
+from engram.doctor.checks.motion import scale_off, turn_ratio
 from engram.doctor.checks.sides import frames_late, upright
 from engram.doctor.examination import Look
+from engram.doctor.findings import Finding
 from engram.doctor.sides import align
 from engram.frontend import StereoPair
 from engram.frontend.sides import SideMatches, match_sides
@@ -366,3 +367,48 @@ def test_motion_from_outside_goes_on_behind_the_frames_that_were_taken_ahead(pai
         assert [stamp_of(one) for one in taken] == [pair.stamp_ns for pair in pairs]
         assert source.between(pairs[2].stamp_ns, pairs[3].stamp_ns) is None
         assert source.between(pairs[3].stamp_ns, pairs[4].stamp_ns) is not None
+
+
+@pytest.mark.parametrize(
+    ("turn_rad", "factor", "found"),
+    [
+        (0.02, 1.0, pytest.approx(1.0)),
+        (0.02, np.rad2deg(1.0), pytest.approx(57.3, abs=0.1)),
+        (1e-4, 3000.0, None),  # a straight road says nothing of the unit
+    ],
+)
+def test_turns_in_degrees_are_told(turn_rad: float, factor: float, found) -> None:
+    turn = SE3.exp([0.0, 0.0, 0.8, 0.0, turn_rad, 0.0])
+    seen = Evidence(DoctorConfig(), moved=[turn] * 24, turned_rad=[factor * turn_rad] * 24)
+    assert turn_ratio(seen) == found
+    (check,) = [one for one in CHECKS if one.code == "turns_in_degrees"]
+    assert isinstance(check.finding(seen), Finding) == (factor > 10 and found is not None)
+
+
+@pytest.mark.parametrize("factor", [1.0, np.rad2deg(1.0)])
+def test_the_front_compares_the_gyroscope_with_odometry(pairs, factor: float) -> None:
+    front = Front(Settings())
+    rates = factor * np.array([0.0, 0.2, 0.0])
+    for number, pair in enumerate(pairs):
+        turned = SE3.exp(np.r_[np.zeros(3), 0.1 * rates])
+        front.take(pair, OutsideMotion(turned, 0.1, False, rates) if number else None)
+    found = front.examination.evidence.turned_rad
+    assert found[0] is None
+    assert found[1:] == pytest.approx([0.1 * float(np.linalg.norm(rates))] * (len(pairs) - 1))
+
+
+def test_the_clock_names_only_what_is_missing(pairs) -> None:
+    for facts, cure in (
+        (Facts(clock=Clock.UTC), "give --zone or --longitude"),
+        (Facts(clock=Clock.RELATIVE, zone="Europe/London"), "give --recorded-at"),
+        (Facts(clock=Clock.RELATIVE), "give --recorded-at and --zone or --longitude"),
+    ):
+        (note,) = [one for one in examined(pairs, facts).findings if one.code == "clock_unstated"]
+        assert note.cure == f"for downloads by hour {cure}"
+
+
+def test_stamps_in_another_unit_do_not_jump(pairs) -> None:
+    slow = [replace(one, stamp_ns=one.stamp_ns * 1000) for one in pairs]
+    found = examined(slow).findings
+    assert [one.code for one in found if one.severity is Severity.WARNING] == ["low_frame_rate"]
+    assert "milliseconds" in found[0].cure

@@ -66,15 +66,16 @@ class BagMaker:
         encoding: str = "mono8",
         received_ns: int | None = None,
         big_endian: bool = False,
+        **stated: int,
     ) -> None:
         stored = image.astype(image.dtype.newbyteorder(">")) if big_endian else image
         message = self.types["sensor_msgs/msg/Image"](
             header=self.header(stamp_ns),
-            height=image.shape[0],
+            height=stated.get("height", image.shape[0]),
             width=image.shape[1],
             encoding=encoding,
             is_bigendian=int(big_endian),
-            step=image[0].nbytes,
+            step=stated.get("step", image[0].nbytes),
             data=np.frombuffer(stored.tobytes(), np.uint8),
         )
         self.write(topic, "sensor_msgs/msg/Image", message, received_ns or stamp_ns)
@@ -87,32 +88,47 @@ class BagMaker:
 
     def info(self, topic: str, stamp_ns: int, values: dict[str, Any], frame: str = "") -> None:
         names = {name: name.upper() if self._is1 else name for name in ("d", "k", "r", "p")}
-        roi = self.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        roi = self.types["sensor_msgs/msg/RegionOfInterest"](
+            *values.get("roi", (0, 0, 0, 0)), do_rectify=False
+        )
         arrays = {names[key]: np.asarray(values[key], np.float64).ravel() for key in names}
         message = self.types["sensor_msgs/msg/CameraInfo"](
             header=self.header(stamp_ns, frame),
             height=values["height"],
             width=values["width"],
             distortion_model=values.get("model", "plumb_bob"),
-            binning_x=0,
-            binning_y=0,
+            binning_x=values.get("binning", 0),
+            binning_y=values.get("binning", 0),
             roi=roi,
             **arrays,
         )
         self.write(topic, "sensor_msgs/msg/CameraInfo", message, stamp_ns)
 
-    def transform(self, stamp_ns: int, parent: str, child: str, parent_from_child: SE3) -> None:
-        types = self.types
-        w, x, y, z = parent_from_child.quaternion_wxyz()
-        shift = types["geometry_msgs/msg/Vector3"](*map(float, parent_from_child.translation))
-        turn = types["geometry_msgs/msg/Quaternion"](float(x), float(y), float(z), float(w))
-        stamped = types["geometry_msgs/msg/TransformStamped"](
-            self.header(stamp_ns, parent),
-            child,
-            types["geometry_msgs/msg/Transform"](shift, turn),
+    def transform(
+        self,
+        stamp_ns: int,
+        parent: str,
+        child: str,
+        parent_from_child: SE3,
+        topic: str = "/tf_static",
+    ) -> None:
+        stamped = self.types["geometry_msgs/msg/TransformStamped"](
+            self.header(stamp_ns, parent), child, self._transform(parent_from_child)
         )
-        message = types["tf2_msgs/msg/TFMessage"]([stamped])
-        self.write("/tf_static", "tf2_msgs/msg/TFMessage", message, stamp_ns)
+        message = self.types["tf2_msgs/msg/TFMessage"]([stamped])
+        self.write(topic, "tf2_msgs/msg/TFMessage", message, stamp_ns)
+
+    def pose(self, topic: str, stamp_ns: int, pose: SE3) -> None:
+        """A pose in no frame, as RealSense's recorder writes it."""
+        self.write(topic, "geometry_msgs/msg/Transform", self._transform(pose), stamp_ns)
+
+    def _transform(self, pose: SE3) -> Any:
+        types = self.types
+        w, x, y, z = map(float, pose.quaternion_wxyz())
+        return types["geometry_msgs/msg/Transform"](
+            types["geometry_msgs/msg/Vector3"](*map(float, pose.translation)),
+            types["geometry_msgs/msg/Quaternion"](x, y, z, w),
+        )
 
     def odometry(self, topic: str, stamp_ns: int, forward_m_s: float, turn_rad_s: float) -> None:
         types = self.types

@@ -60,7 +60,7 @@ def localised_text(
         + (f"; {counted(summary['late_frames'], 'frame')} late" if summary["late_frames"] else ""),
         *_stages(summary["stages_ms"]),
     ]
-    if not summary["statuses"].get("localised", 0) and summary["statuses"].get("lost", 0):
+    if _is_elsewhere(summary):
         lines.append("  nothing in this drive looks like the map: is it of the same place?")
     return _lines(*lines, f"next: {_after_localising(summary, frames, map_path)}")
 
@@ -133,14 +133,23 @@ def _shown(map_path: Path | str) -> str:
     return f"engram plot {typed(map_path)} map.png"
 
 
+def _fatal(summary: Mapping[str, Any]) -> list[str]:
+    return [one["code"] for one in summary["findings"] if one["severity"] == "fatal"]
+
+
+def _is_elsewhere(summary: Mapping[str, Any]) -> bool:
+    """Whether a sound drive was looked for in the whole map, and never found."""
+    statuses = summary["statuses"]
+    found = statuses.get("localised", 0) or not statuses.get("lost", 0)
+    return not found and not _fatal(summary)
+
+
 def _after_localising(
     summary: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], map_path: Path | str
 ) -> str:
-    fatal = [one["code"] for one in summary["findings"] if one["severity"] == "fatal"]
-    if fatal:
+    if fatal := _fatal(summary):
         return f"correct the drive ({', '.join(fatal)}, see the warnings), then localise it again"
-    statuses = summary["statuses"]
-    if statuses.get("lost", 0) and not statuses.get("localised", 0):
+    if _is_elsewhere(summary):
         return (
             "if it is the same place in other light or weather, map it, too: engram map "
             f"{typed(map_path)} DRIVE"

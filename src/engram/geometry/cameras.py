@@ -80,7 +80,7 @@ class StereoCamera:
         if self.baseline_m > LONGEST_BASELINE_M:
             raise CalibrationError(
                 f"camera: baseline_m is {self.baseline_m}, must be at most {LONGEST_BASELINE_M} m: "
-                "is it in millimetres?"
+                "is it in millimetres? divide it by 1000"
             )
         object.__setattr__(self, "id", _content_hash(self))
 

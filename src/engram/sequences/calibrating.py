@@ -20,10 +20,10 @@ from engram.sequences.options import OpenOptions
 # Disparities below this have no sign, px; so many others tell left from right, and such a share of
 # them is negative where the two are exchanged.
 _NO_DISPARITY_PX = 1.0
-_ENOUGH = 200
+_ENOUGH = 80
 _EXCHANGED = 0.5
-# Pairs of a drive that are looked at, at most: every tenth, as the first may be dark.
-TELLING = slice(0, 300, 10)
+# Pairs of a drive that are looked at, at most: every fifth, as the first may be dark.
+TELLING = slice(0, 300, 5)
 
 
 def cameras_of(

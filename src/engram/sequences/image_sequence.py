@@ -136,10 +136,19 @@ class ImageSequence:
                 pair = self.read(index)
             except SequenceError as error:
                 if not self._options.skip_bad:
-                    raise SequenceError(f"{error}; leave it out with --skip-bad") from error
+                    advice = self._advice(index)
+                    raise SequenceError(f"{error}; {advice}") from error
                 self._reading_faults.append(str(error))
                 continue
             yield pair
+
+    def _advice(self, bad: int) -> str:
+        """What to do about a bad pair, by whether others are better."""
+        for index in {0, len(self) // 2, len(self) - 1} - {bad}:
+            with suppress(SequenceError):
+                self.read(index)
+                return "leave it out with --skip-bad"
+        return "the pairs in the middle and at the end cannot be read either"
 
     def bits(self) -> int | None:
         """Bits of the brightest pixel of a few left images of 16 bits; None for 8-bit ones.

@@ -80,7 +80,7 @@ def read_stamps(path: Path, parse: Callable[[str], int | None]) -> list[int]:
         stamp_ns = parse(line.strip())
         if stamp_ns is None:
             unit = _UNITS.get(len(line.strip().partition(".")[0])) if line[:1].isdigit() else None
-            asked = f"; is it in {unit}? stamps here are in seconds" if unit else ""
+            asked = f"; is it in {unit}? stamps here are in seconds: divide them" if unit else ""
             raise SequenceError(f"{path}: line {number} is not a stamp: {line[:60]!r}{asked}")
         stamps_ns.append(stamp_ns)
     if not stamps_ns:

@@ -94,7 +94,7 @@ def turn_ratio(seen: Evidence) -> float | None:
     """
     ratios = [
         turned_rad / step.angle_rad
-        for step, turned_rad in zip(seen.moved, seen.turned_rad, strict=True)
+        for step, turned_rad in zip(seen.moved, seen.turned_rad, strict=False)
         if step is not None and turned_rad is not None and step.angle_rad > _TURNING_RAD
     ]
     return float(np.median(ratios)) if len(ratios) >= seen.config.least_frames else None

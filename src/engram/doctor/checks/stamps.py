@@ -37,9 +37,12 @@ def counted(seen: Evidence) -> float | None:
 
 
 def jump_s(seen: Evidence) -> float | None:
-    """The longest interval."""
+    """The longest interval, if it is not as long as others: stamps in another unit do not jump."""
     intervals_s = seen.intervals_s
-    return float(intervals_s.max()) if len(intervals_s) else None
+    if not len(intervals_s):
+        return None
+    longest_s = float(intervals_s.max())
+    return longest_s if longest_s > seen.config.gap_ratio * np.median(intervals_s) else 0.0
 
 
 def gap_ratio(seen: Evidence) -> float | None:
