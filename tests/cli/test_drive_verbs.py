@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 from pathlib import Path
 
@@ -174,3 +175,82 @@ def test_no_map_is_made_to_see_one_of_its_revisions(tmp_path: Path) -> None:
     with pytest.raises(NotAMapError):
         open_map(tmp_path / "town.engram", at=1, create=True)
     assert list(tmp_path.iterdir()) == []
+
+
+def carried_out(engram, told: str, tmp_path: Path):
+    """Runs the command behind `next:`, with the map's name filled in."""
+    words = shlex.split(next(line for line in told.splitlines() if line.startswith("next: "))[6:])
+    assert words[0] == "engram"
+    return engram(
+        *(str(tmp_path / "m.engram") if one == "MAP.engram" else one for one in words[1:])
+    )
+
+
+def test_the_command_of_a_drive_keeps_what_was_given(engram, street: Path, tmp_path: Path) -> None:
+    drive = tmp_path / "my drive"
+    shutil.copytree(street, drive)
+    (drive / "calibration.toml").rename(tmp_path / "half $.toml")
+    given = ("--calibration", tmp_path / "half $.toml", "--frames", "2:6", "--skip-bad")
+    told = engram("drive", "info", drive, *given)
+    assert told.status == 0, told.err
+    ran = carried_out(engram, told.out, tmp_path)
+    assert ran.status == 0, ran.err
+    assert "4 frames: " in ran.out
+
+
+def test_the_command_of_a_bag_keeps_what_was_given(engram, street_bag, tmp_path: Path) -> None:
+    told = engram("drive", "info", street_bag, "--frames", "2:6", "--robot", "r 2")
+    assert carried_out(engram, told.out, tmp_path).status == 0
+    assert (
+        engram("info", tmp_path / "m.engram", "--sessions", "--json").json["session_list"][0][
+            "robot"
+        ]
+        == "r 2"
+    )
+
+
+def exchanged(street: Path, folder: Path) -> Path:
+    shutil.copytree(street, folder)
+    (folder / "left").rename(folder / "x")
+    (folder / "right").rename(folder / "left")
+    (folder / "x").rename(folder / "right")
+    return folder
+
+
+def test_localising_exchanged_sides_points_at_the_drive(engram, street, tmp_path: Path) -> None:
+    town = tmp_path / "town.engram"
+    engram("map", town, street)
+    found = engram("localise", town, exchanged(street, tmp_path / "wrong"))
+    last = found.out.splitlines()[-1]
+    assert last.startswith("next: correct the drive (sides_swapped")
+    assert "--explain" not in found.out
+    assert "--left, --right" in found.err
+
+
+def test_a_drive_of_another_place_is_told(engram, street, tmp_path: Path) -> None:
+    town, other = tmp_path / "town.engram", tmp_path / "other"
+    engram("map", town, street)
+    shutil.copytree(street, other)
+    for file in (other / "left").iterdir():
+        for side in ("left", "right"):
+            image = cv2.imread(str(other / side / file.name), cv2.IMREAD_GRAYSCALE)
+            # Upside down and turned about: the same pair of cameras before other things.
+            cv2.imwrite(str(other / side / file.name), 255 - image[::-1])
+    found = engram("localise", town, other)
+    assert "nothing in this drive looks like the map" in found.out
+    assert "--explain" not in found.out
+    assert engram("localise", town, street).out.count("nothing in this drive") == 0
+
+
+def test_a_note_on_the_calibration_is_told_once(engram, street: Path, tmp_path: Path) -> None:
+    drive = open_sequence(street)
+    left, right = rectified_infos(drive.camera)
+    p = np.array(right["p"])
+    p[0, 3] *= -1
+    pairs = [(pair.stamp_ns + 10**18, pair.left, pair.right) for pair in drive]
+    path = StereoBag(pairs, (left, {**right, "p": p})).write(tmp_path / "b", "mcap")
+    assert engram("drive", "info", path).out.count("note: the projections state") == 1
+    mapped = engram("map", tmp_path / "m.engram", path)
+    assert mapped.status == 0
+    assert mapped.err.count("note: the projections state") == 1
+    assert engram("localise", tmp_path / "m.engram", street).out.count(" 0 localised") == 0

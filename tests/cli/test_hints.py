@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import re
 import tomllib
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ import typer
 
 from engram.cli import moved, wording
 from engram.cli.app import app
+from engram.cli.options import Drive
 from engram.cli.settings import AllSettings, every_setting
 
 ROOT = Path(__file__).parents[2]
@@ -215,3 +217,16 @@ def test_the_next_step_asks_for_nothing_that_is_not_installed(monkeypatch, drawn
     told = wording.mapped_text(report, "town.engram").splitlines()[-1]
     shown = "engram plot town.engram map.png" if drawn else "engram info town.engram"
     assert told == f"next: engram localise town.engram ANOTHER_DRIVE, or {shown}"
+
+
+def test_options_of_a_drive_are_typed_as_they_were_given() -> None:
+    given = Drive(
+        **{
+            one.name: True if one.default is False else ["a b"] if one.name == "motion" else "a b"
+            for one in dataclasses.fields(Drive)
+        }
+    )
+    words = given.typed()
+    assert {one for one in words if one.startswith("--")} <= options_of(command(("map",)))
+    assert len(words) == 2 * len(dataclasses.fields(Drive)) - 1  # --skip-bad has no value
+    assert Drive().typed() == []

@@ -401,6 +401,10 @@ class TestContainers:
         assert_whole(open_sequence(path))
         assert sorted(one.name for one in path.iterdir()) == ["drive_0.db3", "drive_0.db3-wal"]
 
+    def test_what_a_killed_recorder_of_ros_1_leaves(self, tmp_path) -> None:
+        path = WHOLE.write(tmp_path / "b", "ros1").rename(tmp_path / "b.bag.active")
+        assert_whole(open_sequence(path))
+
 
 class _Refusing:
     """A connection to a database whose index cannot be made."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -51,6 +53,8 @@ def info(
 
     if is_bag(path) and opening.format in {None, "bag"}:
         facts = describe_bag(path, opening.options())
+        if facts.command and (more := opening.typed("left", "right", "calibration", "motion")):
+            facts = replace(facts, command=f"{facts.command} {shlex.join(more)}")
         typer.echo(json.dumps(plain(facts)) if as_json else _bag_text(facts))
         if facts.lost or facts.question:
             raise typer.Exit(3 if facts.lost else 2)
@@ -213,7 +217,7 @@ def _drive_facts(path: Path, opening: options.Drive) -> dict[str, Any]:
         "duration_s": seconds,
         **{name: getattr(sequence.camera, name) for name in _CAMERA},
         "notes": list(sequence.cameras.notes) if isinstance(sequence, ImageSequence) else [],
-        "command": f"engram map MAP.engram {path}",
+        "command": shlex.join(["engram", "map", "MAP.engram", str(path), *opening.typed()]),
     }
 
 

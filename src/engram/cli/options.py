@@ -226,6 +226,24 @@ class Drive:
 
         return options_of(**self.given())
 
+    def typed(self, *besides: str) -> list[str]:
+        """The options that were given, as words of a command.
+
+        Args:
+            besides: names of fields that are left out.
+        """
+        words: list[str] = []
+        for one in dataclasses.fields(self):
+            value, option = getattr(self, one.name), f"--{one.name.strip('_').replace('_', '-')}"
+            if value == one.default or one.name in besides:
+                continue
+            if value is True:
+                words.append(option)
+            else:
+                several = value if isinstance(value, list) else [value]
+                words += [word for each in several for word in (option, str(each))]
+        return words
+
     def given(self) -> dict[str, Any]:
         """Arguments of `engram.sequences.open_sequence` but for path and format."""
         from engram.sequences import TimeRange

@@ -18,6 +18,8 @@ from engram.sequences.bags.ros1 import Ros1Bag
 CONTAINERS: Mapping[str, Callable[[Path], BagFile]] = MappingProxyType(
     {".bag": Ros1Bag, ".mcap": McapBag, ".db3": DatabaseBag}
 )
+# What a recorder of ROS 1 that was killed leaves at the name.
+_UNFINISHED = ".active"
 _NUMBER = re.compile(r"_?(\d+)$")
 # A damaged file may fail at every chunk; more than these are only counted.
 _MOST_LOSSES = 20
@@ -88,7 +90,7 @@ class Bag:
             if self._unpacked is None:
                 self._unpacked = TemporaryDirectory(prefix="engram-bag-")
             path = unpack_file(path, self._unpacked)
-        return CONTAINERS[path.suffix](path)
+        return CONTAINERS[str(_container(path))](path)
 
     def _merge(self, topics: Mapping[str, Topic]) -> None:
         for name, topic in topics.items():
@@ -114,8 +116,8 @@ def files_of(path: Path) -> list[Path]:
 
 
 def _container(path: Path) -> str | None:
-    """Ending of the container that a name stands for, compressed or not."""
-    ending = Path(path.stem).suffix if path.suffix in ENDINGS else path.suffix
+    """Ending of the container that a name stands for, compressed or not, or still recorded."""
+    ending = Path(path.stem).suffix if path.suffix in (*ENDINGS, _UNFINISHED) else path.suffix
     return ending if ending in CONTAINERS else None
 
 

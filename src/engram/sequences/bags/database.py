@@ -79,7 +79,7 @@ class DatabaseBag:
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise DamageError(f"{self.path}: is not an SQLite file")
         try:
-            if not _log_of(self.path).exists():
+            if not _has_log(self.path):
                 return _connected(self.path, "mode=ro&immutable=1")
             # What a killed recorder did not move into the file lies beside it. SQLite reads both
             # only where it can write an index beside them: not on a disk that is read-only.
@@ -97,18 +97,17 @@ class DatabaseBag:
         """A copy of the file and its log in a folder that can be written to; made once."""
         if self._copy is not None:
             return Path(self._copy.name) / self.path.name
-        folder = TemporaryDirectory(prefix="engram-bag-")
-        copy = Path(folder.name) / self.path.name
+        log = _log_of(self.path)
         try:
-            for source, target in ((self.path, copy), (_log_of(self.path), _log_of(copy))):
+            folder = TemporaryDirectory(prefix="engram-bag-")
+            copy = Path(folder.name) / self.path.name
+            for source, target in ((self.path, copy), (log, _log_of(copy))):
                 with os.fdopen(open_regular(source), "rb") as read, target.open("xb") as written:
                     shutil.copyfileobj(read, written)
         except OSError as error:
-            folder.cleanup()
             raise DamageError(
-                f"{self.path}: its last messages lie in {_log_of(self.path).name}, and cannot be "
-                f"copied to {folder.name} to be read: {error.strerror}; copy both files to a "
-                "folder that can be written to"
+                f"{self.path}: its last messages lie in {log.name}, and there is no room for a "
+                f"copy of both: {error.strerror}; copy them to a folder that can be written to"
             ) from error
         self._copy = folder
         return copy
@@ -176,6 +175,11 @@ class DatabaseBag:
 def _log_of(path: Path) -> Path:
     """The write-ahead log of a database."""
     return path.with_name(path.name + "-wal")
+
+
+def _has_log(path: Path) -> bool:
+    log = _log_of(path)
+    return log.exists() and log.stat().st_size > 0
 
 
 def _connected(path: Path, mode: str) -> sqlite3.Connection:
