@@ -97,7 +97,8 @@ CHECKS: tuple[Check, ...] = (
     Check(
         "rows_misaligned", _FATAL, sides.row_offset_px, "row_offset_px", "px",
         "rows of left and right are not aligned",
-        "calibrate again; raw images need a [raw] calibration, so that they are rectified",
+        "are left and right exchanged? otherwise calibrate again; raw images need a [raw] "
+        "calibration, so that they are rectified",
         # In rows that do not correspond, motion down the image looks like a lag.
         explains=("no_odometry", "rows_slightly_off", "not_synchronised"),
     ),

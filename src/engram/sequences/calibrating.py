@@ -32,7 +32,6 @@ def cameras_of(
     folder: Path | None = None,
     *,
     rectified: bool = False,
-    halves: bool = False,
 ) -> Cameras:
     """The calibration that the caller gave, or else the drive's own.
 
@@ -41,13 +40,34 @@ def cameras_of(
         own: reads the drive's own calibration.
         folder: of the left images, for calibrations that state no image size.
         rectified: whether the images are rectified.
-        halves: whether each image holds both sides.
 
     Raises:
         CalibrationError: it cannot be used.
     """
     if options.calibration is None:
         return own()
+    return cameras_given(options, folder, rectified=rectified)
+
+
+def cameras_given(
+    options: OpenOptions,
+    folder: Path | None,
+    *,
+    rectified: bool = False,
+    halves: bool = False,
+) -> Cameras:
+    """The calibration that the caller gave; see `cameras_of`.
+
+    Args:
+        options: how the drive is opened.
+        folder: of the left images.
+        rectified: whether the images are rectified.
+        halves: whether each image holds both sides.
+
+    Raises:
+        CalibrationError: it cannot be used.
+    """
+    assert options.calibration is not None
     return read_calibration(
         options.calibration,
         rectified=rectified,

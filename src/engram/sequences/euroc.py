@@ -111,6 +111,11 @@ def sensor_cameras(left: Path, right: Path, field_of_view_deg: float | None = No
         right_from_left=body_from_right.inverse() @ body_from_left,
         left_from_rig=body_from_left.inverse(),
     )
+    if calibration.is_exchanged:
+        raise CalibrationError(
+            f"{left} and {right}: by T_BS the left camera is {right.parent.name}, and the right "
+            f"camera is {left.parent.name}: exchange the folders {left.parent} and {right.parent}"
+        )
     try:
         return rectified_cameras(calibration, field_of_view_deg)
     except CalibrationError as error:

@@ -14,7 +14,7 @@ from engram.config import load_toml
 from engram.errors import CalibrationError, InputError, SequenceError
 from engram.graph.clock import check_longitude, check_zone
 from engram.graph.model import Clock
-from engram.sequences.calibrating import cameras_of
+from engram.sequences.calibrating import cameras_given
 from engram.sequences.image_sequence import ImageDrive
 from engram.sequences.listing import (
     Listing,
@@ -93,15 +93,12 @@ def find_folder(path: Path, options: OpenOptions) -> ImageDrive:
         check_longitude(calibration.longitude_deg)
         check_zone(calibration.zone)
         clock = parse_choice(Clock, calibration.clock)
-        both = _both(path)
-        cameras = cameras_of(
-            options,
-            lambda: calibration.cameras(options.field_of_view_deg),
-            both or path / "left",
-            halves=both is not None,
-        )
+        own = None if options.calibration else calibration.cameras(options.field_of_view_deg)
     except InputError as error:
         raise CalibrationError(f"{file}: {error}") from error
+    both = _both(path)
+    halves = both is not None
+    cameras = own or cameras_given(options, both or path / "left", halves=halves)
     info = SequenceInfo(
         path.resolve().name,
         "folder",
