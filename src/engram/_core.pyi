@@ -159,6 +159,12 @@ def orthonormalised(rotation: NDArray[np.float64]) -> NDArray[np.float64]: ...
 
 def hamming_matrix(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.uint16]: ...
 
+# --- kept
+
+def kept_rows(
+    before: Features, now: Features, most_bits: int, most_disparity_px: float
+) -> NDArray[np.int32]: ...
+
 # --- matching
 
 class MatchSettings:

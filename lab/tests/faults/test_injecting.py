@@ -32,12 +32,16 @@ from engram_lab.studies.faults.clips import (
 )
 from engram_lab.studies.faults.injected import (
     FAULTS,
+    FROM_THE_FIRST,
     Blackout,
+    FixedPattern,
     Frozen,
     Kidnapped,
     Stall,
+    WrongStamps,
     brightened,
     on_both,
+    reaching_in,
     undisturbed,
 )
 from engram_lab.studies.faults.mapping import map_on
@@ -63,12 +67,31 @@ def test_a_fault_begins_at_its_start_and_changes_something_then(pairs, name: str
     fault = FAULTS[name]
     assert fault.weakest <= fault.strongest
     shown = fault.apply(pairs, fault.strongest, 10, np.random.default_rng(1))
-    for number, one in enumerate(shown[:10]):
+    for number, one in enumerate(shown[: 0 if name in FROM_THE_FIRST else 10]):
         assert one.frame == number
         assert one.pair is pairs[number]
     assert [id(one.pair) for one in shown] != [id(pair) for pair in pairs]
     assert all(one.pair.left.dtype == np.uint8 for one in shown)
     assert all(one.pair.left.shape == (64, 96) for one in shown)
+
+
+@pytest.mark.parametrize("side", ["bottom", "top", "left", "right"])
+def test_a_fixed_pattern_keeps_its_pixels_in_every_frame(pairs, side: str) -> None:
+    pattern = FixedPattern(side=side, depth_m=4.0, contrast=1.0)
+    shown = [one.pair for one in pattern.apply(pairs, 0.25, 10, np.random.default_rng(1))]
+    same = np.all([one.left == shown[0].left for one in shown], axis=0)
+    assert same.mean() == pytest.approx(0.25, abs=0.02)
+    shift = round(CAMERA.focal_baseline / 4.0)
+    covered = reaching_in(64, 96, side, 0.25)
+    both = covered[:, shift:] & covered[:, :-shift]
+    assert (shown[0].left[:, shift:] == shown[0].right[:, :-shift])[both].all()
+
+
+def test_wrong_stamps_are_a_few_and_the_others_stay(pairs) -> None:
+    shown = WrongStamps().apply(pairs, 60.0, 10, np.random.default_rng(1))
+    wrong = [k for k, one in enumerate(shown) if one.pair.stamp_ns != pairs[k].stamp_ns]
+    assert wrong == list(range(10, 10 + len(wrong)))
+    assert 1 <= len(wrong) <= 3
 
 
 def test_a_stall_leaves_out_the_frames_of_its_time(pairs) -> None:

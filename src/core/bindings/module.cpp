@@ -9,6 +9,7 @@ namespace nb = nanobind;
 void bind_extraction(nb::module_ &module);
 void bind_graph_search(nb::module_ &module);
 void bind_hamming(nb::module_ &module);
+void bind_kept(nb::module_ &module);
 void bind_matching(nb::module_ &module);
 void bind_odometry(nb::module_ &module);
 void bind_ordering(nb::module_ &module);
@@ -28,6 +29,7 @@ NB_MODULE(_core, module) {
   bind_extraction(module);
   bind_graph_search(module);
   bind_hamming(module);
+  bind_kept(module);
   bind_matching(module);
   bind_odometry(module);
   bind_ordering(module);

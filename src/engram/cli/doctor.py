@@ -13,6 +13,11 @@ from engram.cli import options
 from engram.cli.endings import EXIT_UNFIT_DRIVE
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from engram.calibration.cameras import Cameras
+    from engram.doctor import Diagnosis
     from engram.frontend import StereoPair
     from engram.robot.front import Arrived
 
@@ -29,7 +34,9 @@ def doctor(
     pictures: Annotated[
         Path | None,
         typer.Option(
-            "--pictures", metavar="DIR", help="Draw four pairs with what both sides show."
+            "--pictures",
+            metavar="DIR",
+            help="Draw four pairs with what both sides show, and what moves with the camera.",
         ),
     ] = None,
     settings: options.SettingsGiven,
@@ -67,6 +74,7 @@ def doctor(
             diagnosis = examine_drive(sequence, resolved, monitor, by_hour=hours, seen=keep)
         if pictures is not None:
             _draw(pictures, pairs)
+            _draw_fixed(pictures, pairs, diagnosis, getattr(sequence, "cameras", None))
         print(json.dumps(diagnosis.to_dict()) if as_json else diagnosis.text())
         if diagnosis.fatal:
             raise typer.Exit(EXIT_UNFIT_DRIVE)
@@ -74,12 +82,30 @@ def doctor(
 
 def _draw(folder: Path, pairs: list[StereoPair]) -> None:
     """Writes a picture of each pair."""
-    import cv2
-
-    from engram.monitor import write_whole
     from engram.viewing.sides import side_picture
 
     folder.mkdir(parents=True, exist_ok=True)
     for number, pair in enumerate(pairs, start=1):
-        with write_whole(folder / f"pair-{number}.png") as draft:
-            draft.write_bytes(cv2.imencode(".png", side_picture(pair))[1].tobytes())
+        _write(folder / f"pair-{number}.png", side_picture(pair))
+
+
+def _draw_fixed(
+    folder: Path, pairs: list[StereoPair], diagnosis: Diagnosis, cameras: Cameras | None
+) -> None:
+    """Writes what moves with the camera, as a picture and as a file for --mask."""
+    from engram.sequences.calibrating import mask_image
+    from engram.viewing.sides import fixed_picture
+
+    if diagnosis.seen is None or cameras is None or not pairs:
+        return
+    _write(folder / "fixed.png", fixed_picture(pairs[-1], diagnosis.seen))
+    _write(folder / "mask.png", mask_image(diagnosis.seen, cameras))
+
+
+def _write(path: Path, picture: NDArray[np.uint8]) -> None:
+    import cv2
+
+    from engram.monitor import write_whole
+
+    with write_whole(path) as draft:
+        draft.write_bytes(cv2.imencode(".png", picture)[1].tobytes())

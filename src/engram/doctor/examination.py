@@ -16,6 +16,7 @@ from engram.frontend.sides import SideMatches, match_sides
 from engram.geometry import SE3, StereoCamera
 from engram.graph.model import Clock
 from engram.odometry import Motion, OdometryStatus
+from engram.odometry.frozen import equal_share
 from engram.sequences import LoggedFrame
 
 Array = NDArray[np.float64]
@@ -53,7 +54,7 @@ class Look:
     Attributes:
         brightness: mean grey levels.
         saturated, black: largest share of white and of black pixels.
-        repeats: whether the image is exactly that of the pair before.
+        repeats: whether the image is that of the pair before, but for a text in it.
         contrast: standard deviations, grey levels.
         rows: (2, R) float32, grey levels: mean of every eighth row, all its pixels.
     """
@@ -91,6 +92,8 @@ class Evidence:
         turned_rad: how far each step turned by gyroscope or wheels; None where it was not measured.
         rematched: how frames fit a map by other calibrations; of none without a map.
         alignments: of some pairs, worked out once at the end; None before.
+        fixed_share: share of the image that moves with the camera.
+        doubted: frames at which nothing told whether the camera or part of its image stood still.
     """
 
     config: DoctorConfig
@@ -113,6 +116,8 @@ class Evidence:
     turned_rad: list[float | None] = field(default_factory=list)
     rematched: Rematched = field(default_factory=Rematched)
     alignments: list[Alignment] | None = None
+    fixed_share: float = 0.0
+    doubted: int = 0
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -207,6 +212,14 @@ class Examination:
             self.evidence.backwards += stamp_ns < last_ns
             self.evidence.repeated += stamp_ns == last_ns
 
+    def _repeats(
+        self,
+        now: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+        last: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+    ) -> tuple[bool, bool]:
+        least = self.evidence.config.equal_share
+        return equal_share(now[0], last[0]) >= least, equal_share(now[1], last[1]) >= least
+
     def _look(self, pair: StereoPair, number: int) -> None:
         small = pair.left[::_STEP, ::_STEP].copy(), pair.right[::_STEP, ::_STEP].copy()
         last, self._last = self._last, small
@@ -215,7 +228,7 @@ class Examination:
                 (float(small[0].mean()), float(small[1].mean())),
                 max(float((one >= _WHITE).mean()) for one in small),
                 max(float((one <= _BLACK).mean()) for one in small),
-                (False, False) if last is None else _equal(small, last),
+                (False, False) if last is None else self._repeats(small, last),
                 (float(small[0].std()), float(small[1].std())),
                 np.array([one[::_STEP].mean(1, np.float32) for one in (pair.left, pair.right)]),
             )
@@ -224,13 +237,6 @@ class Examination:
             self.evidence.sharpness.append(min(_sharpness(pair.left), _sharpness(pair.right)))
             self.evidence.matches.append((number, match_sides(pair)))
             self.evidence.alignments = None
-
-
-def _equal(
-    now: tuple[NDArray[np.uint8], NDArray[np.uint8]],
-    last: tuple[NDArray[np.uint8], NDArray[np.uint8]],
-) -> tuple[bool, bool]:
-    return np.array_equal(now[0], last[0]), np.array_equal(now[1], last[1])
 
 
 def _sharpness(image: NDArray[np.uint8]) -> float:

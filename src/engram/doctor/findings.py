@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from engram.config import plain
 from engram.counts import counted
@@ -65,11 +68,14 @@ class Diagnosis:
         frames: how many frames were examined.
         findings: what is wrong.
         untold: checks that could not be made, and what they would need, by code.
+        seen: (height, width) bool of the rectified left image, False where it moves with the
+            camera; None if nothing does.
     """
 
     frames: int
     findings: tuple[Finding, ...]
     untold: dict[str, str]
+    seen: NDArray[np.bool_] | None = field(default=None, compare=False, repr=False)
 
     @property
     def fatal(self) -> tuple[Finding, ...]:

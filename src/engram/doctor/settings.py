@@ -29,6 +29,9 @@ class DoctorConfig:
             the image: fatal, and a warning.
         no_odometry: share of frames without odometry.
         frozen_frames: images in a row that repeat the one before.
+        equal_share: share of equal pixels of an image that repeats the one before.
+        fixed_share: share of the image that may move with the camera.
+        doubted: share of the frames at which part of the image may stand still without a reason.
         gap_ratio: longest interval between frames, in those around it.
         jump_s: interval that is a step of the clock, not a gap, s.
         least_rate_hz: slower cameras give odometry no prediction.
@@ -60,6 +63,9 @@ class DoctorConfig:
     slight_row_offset_px: Annotated[float, Meta(gt=0)] = 0.8
     no_odometry: Annotated[float, Meta(gt=0, lt=1)] = 0.5
     frozen_frames: Annotated[int, Meta(ge=1)] = 2
+    equal_share: Annotated[float, Meta(gt=0, le=1)] = 0.9
+    fixed_share: Annotated[float, Meta(ge=0, lt=1)] = 0.01
+    doubted: Annotated[float, Meta(ge=0, lt=1)] = 0.1
     gap_ratio: Annotated[float, Meta(gt=1)] = 2.5
     jump_s: Annotated[float, Meta(gt=0)] = 60.0
     least_rate_hz: Annotated[float, Meta(gt=0)] = 4.0

@@ -210,6 +210,20 @@ CHECKS: tuple[Check, ...] = (
         "the frame counts as unusable; look at the camera's driver",
     ),
     Check(
+        "fixed_to_camera", _WARNING, pictures.fixed_share, "fixed_share", "of the image",
+        "part of the image moves with the camera, such as a bonnet, a gripper or dirt; it is left "
+        "out",
+        "clean the lens, or leave that part out from the first frame on: engram doctor DRIVE "
+        "--pictures DIR draws it and writes DIR/mask.png for --mask",
+    ),
+    Check(
+        "stands_still_in_part", _WARNING, pictures.doubted, "doubted", "of the frames",
+        "part of the image stands still while the rest moves, and nothing tells which of them is "
+        "the world; no position rests on such frames",
+        "give --motion with wheels or a gyroscope, or --mask with what is fixed to the camera in "
+        "black",
+    ),
+    Check(
         "overexposed", _WARNING, pictures.saturated, "spoilt_frames", "of the frames",
         "much of the image is white",
         "limit the exposure, or meter the lower half of the image",

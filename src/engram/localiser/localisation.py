@@ -150,6 +150,8 @@ class Localisation:
         resumed: whether an interrupted run had processed this frame: no attempt was made, only the
             motion counts.
         late: whether the result came after the deadline.
+        fixed_share: share of the image that the robot has learnt moves with its camera, and leaves
+            out.
         stage_ms: duration of each stage; "places" only if place recognition ran.
     """
 
@@ -174,6 +176,7 @@ class Localisation:
     saved: NodeId | None = None
     resumed: bool = False
     late: bool = False
+    fixed_share: float = 0.0
     stage_ms: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -202,6 +205,7 @@ class Localisation:
             "open_loop_m": self.open_loop_m,
             "withdraws": list(self.withdraws),
             "damaged": [str(node) for node in self.damaged],
+            "fixed_share": self.fixed_share,
             "ms": self.ms,
         }
 

@@ -119,11 +119,24 @@ class LookedAhead:
 
     def __init__(self, front: Front, sequence: DriveSequence, monitor: Monitor = QUIET) -> None:
         self.sequence = sequence
+        self._begin()
+        self._look(front, monitor)
+        if front.fixed_share:  # what is fixed to the camera is left out from the first frame on
+            front.look_again()
+            self._rest.close()
+            self._begin()
+            self._look(front, monitor)
+
+    def _begin(self) -> None:
+        sequence = self.sequence
         self._rest = arriving(sequence)
         self._ahead: list[LoggedFrame] = []
         self._outside = sequence.motion() if isinstance(sequence, MovedSequence) else None
         # Stamp of the last frame that was taken ahead.
         self._until_ns: int | None = None
+
+    def _look(self, front: Front, monitor: Monitor) -> None:
+        """Takes frames ahead until the doctor has seen enough."""
         with deferred_interrupt() as raise_if_asked:
             while not front.examination.full:
                 arrived = next(self._rest, None)

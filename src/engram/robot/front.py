@@ -21,13 +21,16 @@ from engram.geometry import SE3, StereoCamera
 from engram.graph.graph import ExperienceGraph
 from engram.localiser import Position, StageClock
 from engram.odometry import (
+    FixedPixels,
     GapFiller,
     Motion,
     Odometry,
+    OdometryStatus,
     OdometryStep,
     OutsideModel,
     OutsideMotion,
 )
+from engram.odometry.frozen import Repeats, StandsStill, rests
 from engram.robot.settings import Settings
 from engram.sequences import LoggedFrame
 
@@ -36,9 +39,6 @@ Arrived: TypeAlias = StereoPair | LoggedFrame
 
 # Decoded pairs that wait for the front-end: about 8 MB at KITTI's size.
 _READ_AHEAD = 8
-# A robot that moves more than this between two frames does not see the same image twice.
-_MOVING_M = 0.02
-_MOVING_RAD = float(np.deg2rad(0.2))
 # No robot moves further between two frames.
 _FARTHEST_M = 1e5
 # A year between two frames.
@@ -63,6 +63,7 @@ class Front:
         self.examination = Examination(settings.doctor)
         self._settings = settings
         self._frontend = Frontend(settings.frontend)
+        self._fixed = FixedPixels(settings.fixed, settings.odometry.matcher)
         # Motions of frames that were taken ahead.
         self._ahead: deque[Motion] = deque()
         self.restart()
@@ -72,7 +73,12 @@ class Front:
         self._odometry = Odometry(self._settings.odometry)
         self._gaps = GapFiller(self._settings.gaps)
         self._outside = OutsideModel(self._settings.outside)
-        self._frozen = _FrozenStream()
+        self._repeats = Repeats(self._settings.frozen)
+        self._stands = StandsStill(self._settings.frozen)
+        self._fixed.restart()
+        # Whether the steps of a frame log do not hold: landmarks of it are left out.
+        self._again = False
+        self._before: Frame | None = None
         self.examination.begin()
 
     def check(
@@ -110,7 +116,31 @@ class Front:
     @property
     def diagnosis(self) -> Diagnosis:
         """What the doctor finds in the first frames so far."""
-        return diagnose(self.examination.evidence)
+        evidence = self.examination.evidence
+        evidence.fixed_share, evidence.doubted = self._fixed.share, self._fixed.doubts
+        found = diagnose(evidence)
+        if not self._fixed.share or evidence.camera is None:
+            return found
+        return replace(found, seen=self._fixed.mask(evidence.camera))
+
+    @property
+    def fixed_share(self) -> float:
+        """Share of the image that moves with the camera, and is left out."""
+        return self._fixed.share
+
+    @property
+    def doubts(self) -> int:
+        """Frames at which nothing told whether the camera or part of its image stood still."""
+        return self._fixed.doubts
+
+    def look_again(self) -> None:
+        """Begins the drive again from its first frame, with what was learnt of the camera."""
+        facts = self.examination.evidence.facts
+        self.examination = Examination(self._settings.doctor)
+        self.examination.evidence.facts = facts
+        self._ahead.clear()
+        self._fixed.doubts = 0
+        self.restart()
 
     def match_again(self, live: Frame, best: Callable[[], Frame | None]) -> None:
         """Shows the doctor a frame and what it matched best in a map, if it asks for that."""
@@ -144,35 +174,62 @@ class Front:
     def _taken(
         self, arrived: Arrived, motion: Motion | OutsideMotion | None, clock: StageClock
     ) -> tuple[Frame, Motion]:
-        told: SE3 | None = None
-        turned_rad: float | None = None
+        measured = motion if isinstance(motion, OutsideMotion) else None
         if not isinstance(motion, Motion):
-            self._outside.add(motion)
-            told = motion.prev_from_curr if motion is not None and motion.has_way else None
-            turned_rad = None if motion is None else motion.turned_rad
-        if isinstance(arrived, LoggedFrame):
-            if not isinstance(motion, Motion):
-                motion = self._moved(arrived.odometry, arrived.frame.stamp_ns)
-            self.examination.see(arrived, arrived.frame, motion, told, turned_rad)
-            return arrived.frame, motion
-        frame = self._frontend.extract(arrived)
-        if self._frozen.repeats(arrived):
-            frame = replace(frame, status=FrameStatus.FROZEN)
+            self._outside.add(measured)
+        frame = self._extracted(arrived, measured)
         clock.lap("frontend")
+        look = self._fixed.look(
+            frame, self._outside.guess(), None if measured is None else measured.prev_from_curr
+        )
+        frame = look.frame
         if not isinstance(motion, Motion):
-            step = self._odometry.step(frame, self._outside.guess())
-            motion = self._moved(step, frame.stamp_ns)
-            clock.lap("odometry")
-        self._frozen.note(motion)
+            step = self._stepped(arrived, frame)
+            if self._stands.add(step.prev_from_curr, self._trusted(measured)):
+                frame = replace(frame, status=FrameStatus.FROZEN)
+                step = OdometryStep(OdometryStatus.UNUSABLE_FRAME)
+            if astray := self._fixed.note(step.prev_from_curr):
+                # Nobody knows how long it was led astray, nor how fast the robot is.
+                self._gaps = GapFiller(self._settings.gaps)
+            motion = self._moved(step, frame.stamp_ns, doubted=astray or look.doubted)
+        clock.lap("odometry")
+        told = measured.prev_from_curr if measured is not None and measured.has_way else None
+        turned_rad = None if measured is None else measured.turned_rad
         self.examination.see(arrived, frame, motion, told, turned_rad)
         clock.lap("doctor")
         return frame, motion
 
-    def _moved(self, step: OdometryStep, stamp_ns: int) -> Motion:
+    def _extracted(self, arrived: Arrived, measured: OutsideMotion | None) -> Frame:
+        """The frame of a pair or of a log; an old picture under a new stamp is unusable."""
+        if isinstance(arrived, LoggedFrame):
+            return arrived.frame
+        frame = self._frontend.extract(arrived)
+        repeats = self._repeats.sides(arrived)
+        excused = all(repeats) and rests(self._trusted(measured), self._settings.frozen)
+        if any(repeats) and not excused:
+            return replace(frame, status=FrameStatus.FROZEN)
+        return frame
+
+    def _stepped(self, arrived: Arrived, frame: Frame) -> OdometryStep:
+        """The step of odometry; that of a log holds as long as no landmark of it is left out."""
+        if isinstance(arrived, LoggedFrame) and not self._again:
+            if frame is arrived.frame:
+                self._before = frame
+                return arrived.odometry
+            self._again = True
+            if self._before is not None:
+                self._odometry.step(self._before)
+        return self._odometry.step(frame, self._outside.guess())
+
+    def _trusted(self, measured: OutsideMotion | None) -> OutsideMotion | None:
+        """What wheels and gyroscope measured since the last frame, while they can be trusted."""
+        return None if self._outside.guess() is None else measured
+
+    def _moved(self, step: OdometryStep, stamp_ns: int, *, doubted: bool) -> Motion:
         """Odometry's step, or where it fails or is disproved what wheels and gyroscope say."""
         outside = self._outside
         guess = outside.guess()
-        doubted = (
+        doubted = doubted or (
             guess is not None
             and step.prev_from_curr is not None
             and step.covariance is not None
@@ -182,33 +239,6 @@ class Front:
         motion = self._gaps.motion(step, stamp_ns, guess, doubted=doubted)
         outside.compare(step)
         return motion
-
-
-class _FrozenStream:
-    """Recognises a camera that repeats an old image while the robot moves.
-
-    No two images of a real sensor are equal, not even at rest; those of a simulator without noise
-    are, so that a robot at rest is not suspected. Every fourth pixel both ways is compared, by a
-    copy: a camera's driver may fill the same arrays again and again.
-    """
-
-    def __init__(self) -> None:
-        self._last: tuple[bytes, bytes] | None = None
-        self._moving = False
-
-    def repeats(self, pair: StereoPair) -> bool:
-        """Whether an image is that of the pair before, though the robot moves."""
-        newest = pair.left[::4, ::4].tobytes(), pair.right[::4, ::4].tobytes()
-        last, self._last = self._last, newest
-        if last is None or not self._moving:
-            return False
-        return last[0] == newest[0] or last[1] == newest[1]
-
-    def note(self, motion: Motion) -> None:
-        """What was measured; while images repeat, that from before counts on."""
-        moved = motion.prev_from_curr
-        if moved is not None and not motion.guessed_m:
-            self._moving = moved.distance_m > _MOVING_M or moved.angle_rad > _MOVING_RAD
 
 
 def check_motion(motion: Motion | OutsideMotion) -> None:

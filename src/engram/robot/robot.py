@@ -205,6 +205,8 @@ class Robot:
                 raise
             if deadline is not None and time.perf_counter() > deadline:
                 found = replace(found, late=True)
+            if self._front.fixed_share:
+                found = replace(found, fixed_share=self._front.fixed_share)
             self._front.match_again(frame, self._localiser.best_matched)
             self.last = Seen(arrived, frame, self._localiser.outcomes)
             if self.watch is not None:

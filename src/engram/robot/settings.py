@@ -15,7 +15,13 @@ from engram.frontend.features import fitted_matcher
 from engram.graph.placing import PlacingConfig
 from engram.localiser import Budget, LocaliserConfig
 from engram.mapper import MapperConfig
-from engram.odometry import GapConfig, OdometryConfig, OutsideConfig
+from engram.odometry import (
+    FixedConfig,
+    FrozenConfig,
+    GapConfig,
+    OdometryConfig,
+    OutsideConfig,
+)
 from engram.ranking import check_for_robot
 
 # Settings files that ship with the package: the rules of one paper each.
@@ -35,6 +41,8 @@ class Settings:
     doctor: DoctorConfig = field(default_factory=DoctorConfig)
     outside: OutsideConfig = field(default_factory=OutsideConfig)
     gaps: GapConfig = field(default_factory=GapConfig)
+    fixed: FixedConfig = field(default_factory=FixedConfig)
+    frozen: FrozenConfig = field(default_factory=FrozenConfig)
     placing: PlacingConfig = field(default_factory=PlacingConfig)
 
     def for_descriptor(self, descriptor: DescriptorKind | None) -> Self:

@@ -162,6 +162,28 @@ def check_sides(cameras: Cameras, pairs: Iterable[StereoPair], where: object) ->
         )
 
 
+def mask_image(seen: NDArray[np.bool_], cameras: Cameras) -> NDArray[np.uint8]:
+    """An image for `read_mask` that leaves out what is not seen; the inverse of that.
+
+    Args:
+        seen: (height, width) bool of the rectified left image.
+        cameras: of the drive.
+
+    Returns:
+        (h, w) uint8 of the size of the drive's own images: 255 is used, 0 is left out.
+    """
+    image = np.where(seen, 255, 0).astype(np.uint8)
+    if cameras.rectification is None:
+        return image
+    raw = np.zeros_like(image)
+    columns, rows = cameras.rectification.left.pixels[~seen].T
+    height, width = raw.shape
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    raw[rows[inside], columns[inside]] = 255
+    closed = cv2.morphologyEx(raw, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    return np.asarray(255 - closed, np.uint8)
+
+
 def check_no_view(options: OpenOptions, cameras: Cameras) -> None:
     """Refuses a chosen field of view for images that come rectified.
 

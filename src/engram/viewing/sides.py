@@ -1,4 +1,4 @@
-"""A stereo pair as a picture: left over right, and what the two share."""
+"""A stereo pair as a picture: what both sides share, and what moves with the camera."""
 
 from __future__ import annotations
 
@@ -35,3 +35,15 @@ def side_picture(pair: StereoPair) -> NDArray[np.uint8]:
         ends = [tuple(int(value) for value in np.rint(end)) for end in (pixel, right)]
         cv2.line(picture, ends[0], ends[1], colour, 1, cv2.LINE_AA)
     return np.asarray(picture, np.uint8)
+
+
+def fixed_picture(pair: StereoPair, seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The left image, (h, w, 3) uint8 BGR, red where it moves with the camera.
+
+    Args:
+        pair: the images.
+        seen: (h, w) bool, False where the image moves with the camera.
+    """
+    picture = cv2.cvtColor(pair.left, cv2.COLOR_GRAY2BGR)
+    tinted = 0.5 * picture + 0.5 * np.array(_BAD)
+    return np.where(seen[..., None], picture, tinted).astype(np.uint8)

@@ -41,20 +41,22 @@ def frozen_frames(seen: Evidence) -> float | None:
     """Most images in a row that repeat the one before.
 
     Equal pairs while the robot rests, or before it has moved, say nothing: a simulated camera may
-    have no noise. Where odometry last failed, the robot counts as moving.
+    have no noise. Where odometry last failed, or wheels turn, the robot counts as moving.
     """
     if not seen.looks or len(seen.looks) != len(seen):
         return None
     longest = [0, 0]
     run, moving = [0, 0], False
     for number, look in enumerate(seen.looks):
-        step = seen.moved[number]
+        step, told = seen.moved[number], seen.outside[number]
         still = all(look.repeats)
+        turns = told is not None and told.distance_m > _MOVING_M
         if not any(look.repeats):
             moving = number > 0 if step is None else step.distance_m > _MOVING_M
         for side in (0, 1):
-            run[side] = run[side] + 1 if _repeats(look, side) else 0
-            if not still or moving or run[side] >= _LONG or _frozen(seen, number):
+            old = _repeats(look, side) or (turns and _frozen(seen, number))
+            run[side] = run[side] + 1 if old else 0
+            if not still or moving or turns or run[side] >= _LONG:
                 longest[side] = max(longest[side], run[side])
     return float(max(longest))
 

@@ -44,6 +44,16 @@ def bits(seen: Evidence) -> float | None:
     return None if seen.facts.bits is None else float(seen.facts.bits)
 
 
+def fixed_share(seen: Evidence) -> float | None:
+    """Share of the image that moves with the camera."""
+    return seen.fixed_share if len(seen) >= seen.config.least_frames else None
+
+
+def doubted(seen: Evidence) -> float | None:
+    """Share of the frames in which nothing told whether the robot or part of the image rested."""
+    return seen.doubted / len(seen) if len(seen) >= seen.config.least_frames else None
+
+
 def _spoilt(frames: list[bool]) -> float | None:
     return float(np.mean(frames)) if frames else None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 import cv2
@@ -354,6 +355,145 @@ def with_car(pair: StereoPair, share: float, rng: np.random.Generator) -> Stereo
     return replace(pair, left=images[0], right=images[1])
 
 
+@dataclass(frozen=True, slots=True)
+class FixedPattern:
+    """Part of both images shows something that moves with the camera, from the first frame on.
+
+    Attributes:
+        side: of the image that it reaches in from: "bottom", "top", "left" or "right".
+        depth_m: how far it is from the camera.
+        contrast: of its texture; 1 is from 20 to 200 grey levels.
+    """
+
+    name: str = "fixed pattern"
+    unit: str = "of the image"
+    weakest: float = 0.1
+    strongest: float = 0.6
+    side: str | None = None
+    depth_m: float | None = None
+    contrast: float | None = None
+
+    def apply(
+        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
+    ) -> list[Shown]:
+        """See `Fault`; what is None is drawn."""
+        del start
+        camera = pairs[0].camera
+        side = self.side or str(rng.choice(["bottom", "top", "left", "right"]))
+        depth_m = self.depth_m or float(np.exp(rng.uniform(np.log(1.0), np.log(6.0))))
+        contrast = self.contrast or float(rng.uniform(0.25, 1.0))
+        shift = max(1, round(camera.focal_baseline / depth_m))
+        noise = rng.integers(0, 256, (camera.height, camera.width + shift)).astype(np.uint8)
+        smooth = cv2.GaussianBlur(noise, (0, 0), 2.0).astype(np.float32)
+        spread = (smooth - smooth.min()) / max(float(np.ptp(smooth)), 1.0)
+        texture = np.asarray(90 + contrast * (180 * spread - 90), np.uint8)
+        where = reaching_in(camera.height, camera.width, side, strength)
+
+        def painted(image: Image, first: int) -> Image:
+            return np.where(where, texture[:, first : first + camera.width], image)
+
+        return [
+            Shown(k, replace(one, left=painted(one.left, 0), right=painted(one.right, shift)))
+            for k, one in enumerate(pairs)
+        ]
+
+
+def reaching_in(height: int, width: int, side: str, share: float) -> NDArray[np.bool_]:
+    """(height, width) bool: the part of an image that a thing covers from one side on."""
+    rows, columns = np.indices((height, width))
+    along = {
+        "bottom": (height - 1 - rows) / height,
+        "top": rows / height,
+        "left": columns / width,
+        "right": (width - 1 - columns) / width,
+    }[side]
+    return np.asarray(along < share, np.bool_)
+
+
+@dataclass(frozen=True, slots=True)
+class NeverMoved:
+    """Both cameras repeat their first image, under new stamps, from the first frame on.
+
+    Attributes:
+        burnt_in: whether the driver writes the time into each image.
+    """
+
+    name: str = "frozen from the start"
+    unit: str = "frames"
+    weakest: float = 30.0
+    strongest: float = 100.0
+    burnt_in: bool = False
+
+    def apply(
+        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
+    ) -> list[Shown]:
+        """See `Fault`."""
+        del start, rng
+        first, shown = pairs[0], []
+        for k, pair in enumerate(pairs[: round(strength)]):
+            old = replace(pair, left=first.left, right=first.right)
+            if self.burnt_in:
+                old = on_both(old, partial(written, text=f"{k:06d}"))
+            shown.append(Shown(k, old))
+        return shown + undisturbed(pairs)[round(strength) :]
+
+
+def written(image: Image, text: str) -> Image:
+    """With a text near the upper left corner."""
+    height = max(image.shape[0] // 20, 8)
+    return np.asarray(
+        cv2.putText(image.copy(), text, (8, height + 8), 0, height / 22, 255, 1), np.uint8
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class HuntingExposure:
+    """Exposure that overshoots up and down for the rest of the drive, the sides not quite alike."""
+
+    name: str = "exposure that hunts"
+    unit: str = "times"
+    weakest: float = 1.3
+    strongest: float = 3.0
+    frames: float = 7.0
+    apart: float = 1.2
+
+    def apply(
+        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
+    ) -> list[Shown]:
+        """See `Fault`."""
+        phase = rng.uniform(0, 2 * np.pi)
+        shown = undisturbed(pairs)
+        for k in range(start, len(pairs)):
+            gain = strength ** np.sin(phase + 2 * np.pi * k / self.frames)
+            bright = brightened(pairs[k].left, gain), brightened(pairs[k].right, gain / self.apart)
+            shown[k] = Shown(k, replace(pairs[k], left=bright[0], right=bright[1]))
+        return shown
+
+
+@dataclass(frozen=True, slots=True)
+class WrongStamps:
+    """A few frames carry a stamp that is far off; those after them are right again."""
+
+    name: str = "wrong stamps"
+    unit: str = "s"
+    weakest: float = 0.5
+    strongest: float = 3600.0
+
+    def apply(
+        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
+    ) -> list[Shown]:
+        """See `Fault`."""
+        off_ns = int(rng.choice([-1, 1])) * round(strength * 1e9)
+        few = range(start, start + int(rng.integers(1, 4)))
+        zero = bool(rng.random() < 0.3)
+        return [
+            Shown(k, replace(pair, stamp_ns=0 if zero else pair.stamp_ns + off_ns))
+            if k in few
+            else Shown(k, pair)
+            for k, pair in enumerate(pairs)
+        ]
+
+
 FAULTS: dict[str, Fault] = {
     one.name: one
     for one in (
@@ -388,5 +528,19 @@ FAULTS: dict[str, Fault] = {
         Changed("car ahead", "of the image", 0.1, 0.7,
                 lambda pair, share, _, rng: with_car(pair, share, rng), 40),
         Kidnapped(),
+        FixedPattern(),
+        NeverMoved(),
+        NeverMoved("frozen with a burnt-in time", burnt_in=True),
+        Changed(
+            "right side darker", "times", 1.2, 3.0,
+            lambda pair, gain, *_: replace(pair, right=brightened(pair.right, 1 / gain)),
+        ),
+        HuntingExposure(),
+        WrongStamps(),
     )
 }  # fmt: skip
+
+# Faults that are there from the first frame on, whatever the start.
+FROM_THE_FIRST = frozenset(
+    {"fixed pattern", "frozen from the start", "frozen with a burnt-in time"}
+)

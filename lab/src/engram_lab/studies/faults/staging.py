@@ -9,7 +9,7 @@ import numpy as np
 
 from engram.localiser import Position
 from engram_lab.studies.faults.clips import Clip, ClipPlan, Plan
-from engram_lab.studies.faults.injected import FAULTS, Shown, undisturbed
+from engram_lab.studies.faults.injected import FAULTS, FROM_THE_FIRST, Shown, undisturbed
 from engram_lab.studies.faults.places import Place, Places
 
 NONE = "none"
@@ -22,7 +22,7 @@ KINDS = (NONE, OTHER_TOWN, CARRIED, REVERSE, TURNED, DAMAGED, *FAULTS)
 # Of these, no frame of the clip has a right fix where nothing is wrong.
 ELSEWHERE = frozenset({OTHER_TOWN, REVERSE, TURNED})
 # Changes with what a number means, so that results of two meanings are not mixed.
-DRAW = 2
+DRAW = 3
 # Frames before a fault, in which the robot finds itself, and after its start.
 _BEFORE, _AFTER = 15, 25
 # Frames of a drive that are shown, at most.
@@ -80,6 +80,8 @@ def staged(fault: str, plan: Plan, places: Places, rng: np.random.Generator) -> 
     clip, place = places.clip(plan), places.other if fault == OTHER_TOWN else places.own
     start = int(rng.integers(_BEFORE, max(_BEFORE + 1, len(clip) - _AFTER)))
     strength = _strength(fault, rng)
+    if fault in FROM_THE_FIRST:
+        start = 0
     if fault == REVERSE:
         first = start - _BEFORE
         clip, start = Clip(plan, clip.pairs[first:], clip.world_from_cam[first:]), 0
