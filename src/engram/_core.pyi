@@ -22,6 +22,13 @@ def order_corners(
 ) -> NDArray[np.int32]: ...
 def smooth(image: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
 def halve(image: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
+def side_difference(
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    max_disparity_px: int,
+    mask: NDArray[np.bool_] | None = None,
+) -> float: ...
+def even_contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]: ...
 def describe(smoothed: NDArray[np.uint8], positions: NDArray[np.int16]) -> NDArray[np.uint8]: ...
 def measure_disparities(
     left: NDArray[np.uint8],
@@ -34,6 +41,7 @@ def measure_disparities(
     max_sigma_px: float,
     sigma_floor_px: float,
     sigma_scale: float,
+    sides_differ: bool = False,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
 def quantise_landmarks(
     pixels: NDArray[np.float32],
@@ -63,6 +71,8 @@ def extract(
     sigma_floor_px: float,
     sigma_scale: float,
     second_threshold: int = 0,
+    side_difference: float = 0,
+    mask: NDArray[np.bool_] | None = None,
 ) -> tuple[
     NDArray[np.float32],
     NDArray[np.float32],

@@ -4,13 +4,15 @@ import hashlib
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from tests.core.textures import shifted_pair, texture
-from tests.reference import brief, corners, disparity
+from tests.reference import brief, corners, disparity, sides
 
 from engram import _core
 
@@ -122,19 +124,44 @@ def test_descriptors_equal_the_definition() -> None:
     np.testing.assert_array_equal(_core.describe(image, positions), expected)
 
 
+def darker(image: np.ndarray, gain: float, offset: float = 0.0) -> np.ndarray:
+    return np.clip(np.rint(image * gain + offset), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("image", IMAGES.values(), ids=IMAGES)
+def test_evened_images_equal_the_definition(image: np.ndarray) -> None:
+    np.testing.assert_array_equal(_core.even_contrast(image), sides.even_contrast(image))
+
+
+@pytest.mark.parametrize("shape", [(15, 40), (34, 34), (150, 330), (200, 500)])
+@pytest.mark.parametrize("gain", [1.0, 0.6])
+def test_how_much_sides_differ_equals_the_definition(shape: tuple[int, int], gain: float) -> None:
+    left, right = (texture(*shape, seed) for seed in (31, 32))
+    right = darker(right, gain)
+    mask = np.ones(shape, np.bool_)
+    mask[-40:, :90] = False
+    for seen in (None, mask, np.zeros_like(mask)):
+        found = _core.side_difference(left, right, 60, seen)
+        assert found == pytest.approx(sides.side_difference(left, right, 60, seen), rel=1e-3)
+
+
 def measure_all(left: np.ndarray, right: np.ndarray, positions: np.ndarray, **changed: float):
     return _core.measure_disparities(left, right, positions, **{**STEREO, **changed})
 
 
+@pytest.mark.parametrize("sides_differ", [False, True])
 @pytest.mark.parametrize("noise", [0.0, 4.0])
-def test_disparities_equal_the_definition(noise: float) -> None:
+def test_disparities_equal_the_definition(noise: float, sides_differ: bool) -> None:
     left, right = shifted_pair(100, 220, 12.25, seed=10, noise=noise)
     right[:, 100:110] = 40  # an occluder, so that some are refused
+    if sides_differ:
+        right = darker(right, 0.4)
     positions, _, _ = _core.detect_corners(left, 10)
-    measured, sigma = measure_all(left, right, positions)
+    measured, sigma = measure_all(left, right, positions, sides_differ=sides_differ)
+    definition = partial(disparity.measure, left, right, sides_differ=sides_differ, **STEREO)
     accepted = 0
     for (x, y), d, s in zip(positions, measured, sigma, strict=True):
-        expected = disparity.measure(left, right, int(x), int(y), **STEREO)
+        expected = definition(int(x), int(y))
         assert (d > 0) == (expected is not None)
         if expected is not None:
             accepted += 1
@@ -155,6 +182,60 @@ def test_sub_pixel_disparity_is_true_and_its_sigma_honest(truth_px: float) -> No
     normalised = error / predicted
     # Half way between two pixels the linear model leaves some residual: σ is somewhat too large.
     assert 0.5 < 1.4826 * np.median(np.abs(normalised)) < 1.2
+
+
+CHANGES = {
+    "as it is": lambda image: image,
+    "× 0.7": lambda image: darker(image, 0.7),
+    "× 0.35": lambda image: darker(image, 0.35),
+    "fogged": lambda image: darker(image, 0.5, 64),
+    "dirty": lambda image: darker(image, 0.3, 90),
+    "bright": lambda image: darker(image, 1.3),
+    "vignetted": lambda image: darker(image, np.linspace(0.3, 1, image.shape[1])),
+    "veiled": lambda image: darker(image, 0.5, np.linspace(0, 100, image.shape[1])),
+}
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_sides_that_differ_are_measured_as_if_they_did_not(
+    change: Callable[[np.ndarray], np.ndarray], side: str
+) -> None:
+    pair = dict(zip(("left", "right"), shifted_pair(240, 480, 17.25, seed=11), strict=True))
+    pair[side] = change(pair[side])
+    settings = {**EXTRACT, "landmarks": 300, "max_residual": 0.7}
+    _, measured, sigma, _, _, _ = _core.extract(
+        *pair.values(), with_descriptors=False, side_difference=0.25, **settings
+    )
+    error = measured - 17.25
+    assert len(error) == 300
+    assert (np.abs(error) < 1).mean() > 0.98
+    assert abs(np.median(error)) < 0.02
+    # Grey levels of the darker side are coarser: σ has to know.
+    assert 1.4826 * np.median(np.abs(error / sigma)) < 1
+
+
+def test_sides_that_are_alike_give_the_same_bits() -> None:
+    left, right = shifted_pair(300, 400, 9.5, seed=16, noise=2.0)
+    for gain, same in ((1.0, True), (0.95, True), (0.6, False)):
+        never, where_they_differ = (
+            _core.extract(
+                left, darker(right, gain), with_descriptors=True, side_difference=limit, **EXTRACT
+            )
+            for limit in (0, 0.25)
+        )
+        assert np.array_equal(never[1], where_they_differ[1]) == same
+
+
+def test_the_robots_body_does_not_make_sides_differ() -> None:
+    left, right = shifted_pair(300, 480, 9.5, seed=16)
+    mask = np.ones(left.shape, np.bool_)
+    mask[150:] = False
+    left[~mask] = 20  # painted over
+    assert _core.side_difference(left, right, 60) > 0.5
+    assert _core.side_difference(left, right, 60, mask) < 0.1
+    with pytest.raises(ValueError, match="mask and left image differ in size"):
+        _core.side_difference(left, right, 60, mask[1:])
 
 
 def test_a_repeated_pattern_has_no_disparity() -> None:
@@ -238,6 +319,7 @@ def test_any_image_size_is_read_within_bounds() -> None:
                 image,
                 with_descriptors=True,
                 second_threshold=1,
+                side_difference=1e-9,
                 **{**EXTRACT, "octaves": 4, "fast_threshold": 1, "max_disparity_px": most},
             )
 
@@ -270,8 +352,10 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
 def digest() -> str:
     """Hash of all that extraction computes on two images."""
     total = hashlib.sha256()
-    for left, right in (shifted_pair(200, 330, 21.75, seed=20, noise=5.0), (IMAGES["noise"],) * 2):
-        settings = {**EXTRACT, "landmarks": 600, "second_threshold": 3}
+    usual = shifted_pair(200, 330, 21.75, seed=20, noise=5.0)
+    pairs = usual, (usual[0], darker(usual[1], 0.4)), (IMAGES["noise"],) * 2
+    for left, right in pairs:
+        settings = {**EXTRACT, "landmarks": 600, "second_threshold": 3, "side_difference": 0.25}
         for part in _core.extract(left, right, with_descriptors=True, **settings)[:5]:
             total.update(np.ascontiguousarray(part).tobytes())
         total.update(_core.detect_corners(left, 3)[1].tobytes())

@@ -112,6 +112,26 @@ def test_useless_images_are_named_and_never_an_error(left, right, status) -> Non
     assert Frontend().extract(pair(left, right)).status is status
 
 
+def test_a_darker_side_gives_as_many_landmarks_and_another_hash_than_without() -> None:
+    dark = pair(right=(0.35 * RIGHT).astype(np.uint8))
+    as_they_are = Frontend(FrontendConfig(side_difference=0))
+    usual = len(as_they_are.extract(pair()).landmarks)
+    assert len(as_they_are.extract(dark).landmarks) < 0.5 * usual
+    assert len(Frontend().extract(dark).landmarks) > 0.97 * usual
+    assert Frontend().hash != as_they_are.hash
+
+
+def test_a_body_in_the_picture_does_not_change_how_sides_are_compared() -> None:
+    mask = np.ones(LEFT.shape, np.bool_)
+    mask[LEFT.shape[0] // 2 :] = False
+    masked = dataclasses.replace(pair(), mask=mask)
+    frames = [
+        Frontend(FrontendConfig(side_difference=limit)).extract(masked) for limit in (0, 0.25)
+    ]
+    assert len(frames[0].landmarks) > 50
+    np.testing.assert_array_equal(*(one.landmarks.disparity_px for one in frames))
+
+
 def test_hash_names_version_and_settings() -> None:
     config = FrontendConfig(landmarks=500)
     assert Frontend(config).hash == Frontend(dataclasses.replace(config)).hash

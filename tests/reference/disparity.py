@@ -3,6 +3,7 @@
 import numpy as np
 
 from .brief import halve
+from .sides import even_contrast
 
 
 def _half_costs(window: np.ndarray, image: np.ndarray, row: int, columns: np.ndarray) -> np.ndarray:
@@ -38,6 +39,17 @@ def search_half(
     return disparity if costs_back[near].min() == costs_back.min() else None
 
 
+def _brought(image: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The right image with the brightness and contrast of the left window, given both windows."""
+    energy = [left.size * (w.astype(int) ** 2).sum() - w.sum(dtype=int) ** 2 for w in (left, right)]
+    gain = np.float32(np.sqrt(energy[0] / max(energy[1], 1)))
+    means = [
+        np.float32(window.sum(dtype=int)) / np.float32(window.size) for window in (left, right)
+    ]
+    level = means[0] + np.float32(0.5) + gain * (image.astype(np.float32) - means[1])
+    return np.clip(level, 0, 255).astype(np.uint8)
+
+
 def measure(
     left: np.ndarray,
     right: np.ndarray,
@@ -51,9 +63,13 @@ def measure(
     max_sigma_px: float,
     sigma_floor_px: float,
     sigma_scale: float,
+    sides_differ: bool = False,
 ) -> tuple[float, float] | None:
     """Disparity and σ at a corner, px, or None."""
-    coarse = search_half(halve(left), halve(right), x // 2, y // 2, max_disparity_px, uniqueness)
+    halves = [halve(left), halve(right)]
+    if sides_differ:
+        halves = [even_contrast(half) for half in halves]
+    coarse = search_half(*halves, x // 2, y // 2, max_disparity_px, uniqueness)
     if coarse is None or x - (2 * coarse + 3) < 8:
         return None
     rows, columns = slice(y - 4, y + 5), np.arange(x - 8, x + 8)
@@ -63,6 +79,9 @@ def measure(
     energy = (gradient**2).sum()
     if energy == 0:
         return None
+
+    if sides_differ:
+        right = _brought(right, left[rows][:, columns], right[rows][:, columns - 2 * coarse])
 
     def residual(d: int) -> np.ndarray:
         return here - right[rows][:, columns - d]

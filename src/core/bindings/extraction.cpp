@@ -1,8 +1,10 @@
 #include "kernels/extraction.hpp"
 
 #include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
 
 #include <array>
+#include <optional>
 #include <stdexcept>
 #include <string>
 
@@ -11,6 +13,7 @@
 #include "kernels/corners.hpp"
 #include "kernels/pyramid.hpp"
 #include "kernels/quantise.hpp"
+#include "kernels/sides.hpp"
 
 namespace nb = nanobind;
 using namespace nb::literals;
@@ -20,6 +23,7 @@ namespace {
 using engram::Corner;
 using engram::Image;
 using GreyImage = engram::Input<uint8_t, 2>;
+using BodyMask = engram::Input<bool, 2>;
 using Positions = nb::ndarray<const int16_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 
 constexpr int64_t longest_side_px = 32767; // positions are int16
@@ -43,6 +47,21 @@ void require_same_size(const Image &left, const Image &right) {
           "left and right image differ in size");
 }
 
+// Of the left image: false on the robot's body; null without one.
+const bool *seen_of(const std::optional<BodyMask> &mask, const Image &left) {
+  if (!mask)
+    return nullptr;
+  require(static_cast<int64_t>(mask->shape(0)) == left.height &&
+              static_cast<int64_t>(mask->shape(1)) == left.width,
+          "mask and left image differ in size");
+  return mask->data();
+}
+
+void require_disparity(int max_disparity_px) {
+  require(max_disparity_px >= 1 && max_disparity_px <= most_disparity_px,
+          "max_disparity_px must lie in 1 to 500");
+}
+
 void require_threshold(int threshold) {
   require(threshold >= 1 && threshold <= 254, "the FAST threshold must lie in 1 to 254");
 }
@@ -62,8 +81,7 @@ std::vector<Corner> corners_inside(const Positions &positions, const Image &imag
 engram::StereoSettings stereo_settings(int max_disparity_px, float min_disparity_px,
                                        float uniqueness, float max_residual, float max_sigma_px,
                                        float sigma_floor_px, float sigma_scale) {
-  require(max_disparity_px >= 1 && max_disparity_px <= most_disparity_px,
-          "max_disparity_px must lie in 1 to 500");
+  require_disparity(max_disparity_px);
   require(min_disparity_px > 0, "min_disparity_px must be above 0");
   return {max_disparity_px, min_disparity_px, uniqueness, max_residual,
           max_sigma_px,     sigma_floor_px,   sigma_scale};
@@ -153,7 +171,7 @@ auto describe(const GreyImage &smoothed, const Positions &positions) {
 auto measure_disparities(const GreyImage &left_array, const GreyImage &right_array,
                          const Positions &positions, int max_disparity_px, float min_disparity_px,
                          float uniqueness, float max_residual, float max_sigma_px,
-                         float sigma_floor_px, float sigma_scale) {
+                         float sigma_floor_px, float sigma_scale, bool sides_differ) {
   const Image left = view(left_array), right = view(right_array);
   require_same_size(left, right);
   const auto settings = stereo_settings(max_disparity_px, min_disparity_px, uniqueness,
@@ -163,11 +181,16 @@ auto measure_disparities(const GreyImage &left_array, const GreyImage &right_arr
   std::vector<float> disparities(count), sigmas(count);
   {
     nb::gil_scoped_release unlocked;
-    const std::vector<uint8_t> left_half = half_of(left), right_half = half_of(right);
-    const engram::StereoImages images{left,
-                                      right,
-                                      {left_half.data(), left.width / 2, left.height / 2},
-                                      {right_half.data(), left.width / 2, left.height / 2}};
+    std::vector<uint8_t> left_half = half_of(left), right_half = half_of(right);
+    const Image halves[] = {{left_half.data(), left.width / 2, left.height / 2},
+                            {right_half.data(), left.width / 2, left.height / 2}};
+    if (sides_differ) {
+      const std::vector<uint8_t> given[] = {left_half, right_half};
+      for (const int side : {0, 1})
+        ENGRAM_CALL(even_contrast, {given[side].data(), halves[side].width, halves[side].height},
+                    side == 0 ? left_half.data() : right_half.data());
+    }
+    const engram::StereoImages images{left, right, halves[0], halves[1], sides_differ};
     for (size_t i = 0; i < count; ++i)
       if (!ENGRAM_CALL(measure_disparity, images, corners[i].x, corners[i].y, settings,
                        &disparities[i], &sigmas[i]))
@@ -180,9 +203,11 @@ auto measure_disparities(const GreyImage &left_array, const GreyImage &right_arr
 auto extract(const GreyImage &left_array, const GreyImage &right_array, int landmarks, int octaves,
              int fast_threshold, int cell_px, bool with_descriptors, int max_disparity_px,
              float min_disparity_px, float uniqueness, float max_residual, float max_sigma_px,
-             float sigma_floor_px, float sigma_scale, int second_threshold) {
+             float sigma_floor_px, float sigma_scale, int second_threshold, float side_difference,
+             const std::optional<BodyMask> &mask) {
   const Image left = view(left_array), right = view(right_array);
   require_same_size(left, right);
+  const bool *seen = seen_of(mask, left);
   require(second_threshold >= 0 && second_threshold <= 254,
           "second_threshold must lie in 0 to 254");
   require(landmarks >= 1 && landmarks <= 1'000'000, "landmarks must lie in 1 to 1000000");
@@ -190,7 +215,7 @@ auto extract(const GreyImage &left_array, const GreyImage &right_array, int land
   require(cell_px >= 4, "cell_px must be at least 4");
   require_threshold(fast_threshold);
   const engram::ExtractionSettings settings{
-      landmarks, octaves, fast_threshold, cell_px, second_threshold,
+      landmarks, octaves, fast_threshold, cell_px, second_threshold, side_difference,
       stereo_settings(max_disparity_px, min_disparity_px, uniqueness, max_residual, max_sigma_px,
                       sigma_floor_px, sigma_scale)};
   const auto room = static_cast<size_t>(landmarks);
@@ -200,7 +225,7 @@ auto extract(const GreyImage &left_array, const GreyImage &right_array, int land
   {
     nb::gil_scoped_release unlocked;
     counts = ENGRAM_CALL(
-        extract, left, right, settings,
+        extract, left, right, {seen, left.width, left.height}, settings,
         {pixels.data(), disparities.data(), sigmas.data(),
          with_descriptors ? reinterpret_cast<uint64_t *>(descriptors.data()) : nullptr,
          levels.data()});
@@ -211,6 +236,29 @@ auto extract(const GreyImage &left_array, const GreyImage &right_array, int land
                         engram::to_numpy(std::move(sigmas), {count}),
                         engram::to_numpy(std::move(descriptors), {with_descriptors ? count : 0, 32}),
                         engram::to_numpy(std::move(levels), {count}), counts.corners);
+}
+
+float side_difference(const GreyImage &left_array, const GreyImage &right_array,
+                      int max_disparity_px, const std::optional<BodyMask> &mask) {
+  const Image left = view(left_array), right = view(right_array);
+  require_same_size(left, right);
+  require_disparity(max_disparity_px);
+  const bool *seen = seen_of(mask, left);
+  nb::gil_scoped_release unlocked;
+  const std::vector<uint8_t> left_half = half_of(left), right_half = half_of(right);
+  return ENGRAM_CALL(side_difference, {left_half.data(), left.width / 2, left.height / 2},
+                     {right_half.data(), left.width / 2, left.height / 2},
+                     {seen, left.width, left.height}, max_disparity_px);
+}
+
+auto even_contrast(const GreyImage &array) {
+  const Image image = view(array);
+  std::vector<uint8_t> evened(array.size());
+  {
+    nb::gil_scoped_release unlocked;
+    ENGRAM_CALL(even_contrast, image, evened.data());
+  }
+  return engram::to_numpy(std::move(evened), {array.shape(0), array.shape(1)});
 }
 
 // Of any detector's keypoints, ours or another's.
@@ -275,11 +323,16 @@ void bind_extraction(nb::module_ &module) {
              "cell_px"_a, "Indices (N,) int32: best corner of each cell first, then the second.");
   module.def("smooth", &smooth, "image"_a, "Binomial 5×5 blur; the outer two pixels are zero.");
   module.def("halve", &halve, "image"_a, "Mean of 2×2 pixels, rounded half up.");
+  module.def("side_difference", &side_difference, "left"_a, "right"_a, "max_disparity_px"_a,
+             "mask"_a = nb::none(),
+             "By how much the sides differ in brightness and contrast, as a share of the contrast.");
+  module.def("even_contrast", &even_contrast, "image"_a,
+             "The image freed of local brightness and contrast.");
   module.def("describe", &describe, "smoothed"_a, "positions"_a,
              "BRIEF-256 (N, 32) uint8 at corners (N, 2) int16 of a smoothed image.");
   module.def("measure_disparities", &measure_disparities, "left"_a, "right"_a, "positions"_a,
              "max_disparity_px"_a, "min_disparity_px"_a, "uniqueness"_a, "max_residual"_a, "max_sigma_px"_a,
-             "sigma_floor_px"_a, "sigma_scale"_a,
+             "sigma_floor_px"_a, "sigma_scale"_a, "sides_differ"_a = false,
              "Disparities and σ (N,) float32 px at corners (N, 2) int16; 0 where there is none.");
   module.def("quantise_landmarks", &quantise_landmarks, "pixels"_a, "disparity_px"_a, "sigma_px"_a,
              "quantum_px"_a, "sigma_table"_a, "sigma_borders"_a, "camera"_a,
@@ -290,7 +343,7 @@ void bind_extraction(nb::module_ &module) {
   module.def("extract", &extract, "left"_a, "right"_a, "landmarks"_a, "octaves"_a,
              "fast_threshold"_a, "cell_px"_a, "with_descriptors"_a, "max_disparity_px"_a,
              "min_disparity_px"_a, "uniqueness"_a, "max_residual"_a, "max_sigma_px"_a, "sigma_floor_px"_a,
-             "sigma_scale"_a, "second_threshold"_a = 0,
+             "sigma_scale"_a, "second_threshold"_a = 0, "side_difference"_a = 0, "mask"_a = nb::none(),
              "Stereo pair → pixels (N, 2), disparities, σ (N,) float32, descriptors (N, 32), "
              "octaves (N,) uint8, number of corners.");
 }

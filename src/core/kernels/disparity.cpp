@@ -159,32 +159,47 @@ int search_half(const StereoImages &images, int64_t x, int64_t y, const StereoSe
 
 constexpr int fine_left = fine_width / 2, fine_above = fine_height / 2;
 
+// Brightness and contrast of a window, exact.
+struct Levels {
+  int32_t sum;
+  int64_t energy; // fine_pixels · Σ (value − mean)²
+};
+
+Levels levels_of(const uint8_t *window, int64_t stride) {
+  const Pixels ones = Pixels{} + int16_t{1};
+  Totals sums{}, squares{};
+  for (int part = 0; part < kWindowParts; ++part) {
+    const Pixels value = pixels_of(window, stride, part);
+    sums = plus_products(sums, value, ones);
+    squares = plus_products(squares, value, value);
+  }
+  const int32_t sum = total_of(sums);
+  return {sum, int64_t{fine_pixels} * total_of(squares) - int64_t{sum} * sum};
+}
+
 // The left window: its values and twice their horizontal gradient.
 struct Template {
   FineWindow value, gradient;
   int32_t gradient_sum;
   int64_t gradient_energy; // fine_pixels · Σ (G − mean G)²
-  int64_t value_energy;    // fine_pixels · Σ (L − mean L)²
+  Levels levels;
 };
 
 Template take_template(const uint8_t *left, int64_t stride) {
   const Pixels ones = Pixels{} + int16_t{1};
   Template window;
-  Totals sums{}, squares{}, value_sums{}, value_squares{};
+  Totals sums{}, squares{};
   for (int part = 0; part < kWindowParts; ++part) {
-    const Pixels value = window.value[part] = pixels_of(left, stride, part);
+    window.value[part] = pixels_of(left, stride, part);
     const Pixels gradient = window.gradient[part] =
         pixels_of(left + 1, stride, part) - pixels_of(left - 1, stride, part);
     sums = plus_products(sums, gradient, ones);
     squares = plus_products(squares, gradient, gradient);
-    value_sums = plus_products(value_sums, value, ones);
-    value_squares = plus_products(value_squares, value, value);
   }
-  const int32_t sum = total_of(sums), value_sum = total_of(value_sums);
+  const int32_t sum = total_of(sums);
   window.gradient_sum = sum;
   window.gradient_energy = int64_t{fine_pixels} * total_of(squares) - int64_t{sum} * sum;
-  window.value_energy =
-      int64_t{fine_pixels} * total_of(value_squares) - int64_t{value_sum} * value_sum;
+  window.levels = levels_of(left, stride);
   return window;
 }
 
@@ -223,6 +238,35 @@ double shift_sigma_px(const Template &window, double unexplained) {
                    static_cast<double>(window.gradient_energy));
 }
 
+// What the fine search reads of the right image, so far to either side of its window; rows are as
+// long as vectors have it, and longer than they need be.
+constexpr int strip_reach = 3, strip_stride = 32;
+
+struct Strip {
+  uint8_t pixels[fine_height * strip_stride];
+
+  const uint8_t *window() const { return pixels + strip_reach; }
+};
+
+// Brings the right image about a window to the brightness and contrast of the left one.
+void bring(const uint8_t *right, int64_t stride, const Levels &left, Strip &strip) {
+  const Levels own = levels_of(right, stride);
+  // Of a window without contrast only noise is left, whatever it is multiplied with.
+  const auto gain = static_cast<float>(std::sqrt(
+      static_cast<double>(left.energy) / static_cast<double>(std::max<int64_t>(own.energy, 1))));
+  const float from = static_cast<float>(own.sum) / fine_pixels;
+  const float to = static_cast<float>(left.sum) / fine_pixels + 0.5f;
+  for (int row = 0; row < fine_height; ++row) {
+    const uint8_t *__restrict__ pixels = right + row * stride - strip_reach;
+    uint8_t *__restrict__ brought = strip.pixels + row * strip_stride;
+    for (int column = 0; column < strip_stride; ++column) {
+      const float level = to + gain * (static_cast<float>(pixels[column]) - from);
+      brought[column] =
+          static_cast<uint8_t>(static_cast<int32_t>(std::min(std::max(level, 0.0f), 255.0f)));
+    }
+  }
+}
+
 } // namespace
 
 bool measure_disparity(const StereoImages &images, int64_t x, int64_t y,
@@ -236,31 +280,38 @@ bool measure_disparity(const StereoImages &images, int64_t x, int64_t y,
   const int64_t window_at = (y - fine_above) * stride + x - fine_left;
   const uint8_t *left = images.left.pixels + window_at;
   const uint8_t *right = images.right.pixels + window_at;
+  int64_t right_stride = stride;
+  const Template window = take_template(left, stride);
+  if (window.gradient_energy == 0)
+    return false;
+  Strip strip;
+  if (images.sides_differ) {
+    bring(right - 2 * coarse, stride, window.levels, strip);
+    right = strip.window() + 2 * coarse;
+    right_stride = strip_stride;
+  }
 
   int whole = 0, best = INT32_MAX;
   for (int d = 2 * coarse - 2; d <= 2 * coarse + 2; ++d) {
-    const int cost = sum_of_differences(left, right - d, stride);
+    const int cost = sum_of_differences(left, stride, right - d, right_stride);
     if (cost < best) {
       best = cost;
       whole = d;
     }
   }
 
-  const Template window = take_template(left, stride);
-  if (window.gradient_energy == 0)
-    return false;
-  Residual low = compare(window, right - whole, stride), high = low;
+  Residual low = compare(window, right - whole, right_stride), high = low;
   if (low.along_gradient > 0)
-    low = compare(window, right - --whole, stride);
+    low = compare(window, right - --whole, right_stride);
   else
-    high = compare(window, right - (whole + 1), stride);
+    high = compare(window, right - (whole + 1), right_stride);
   if (low.along_gradient > 0 || high.along_gradient <= 0)
     return false; // no zero beside the best: two surfaces in the window, or no texture
   const auto below = static_cast<double>(low.along_gradient);
   const auto above = static_cast<double>(high.along_gradient);
   const double fraction = -below / (above - below);
   const double unexplained = unexplained_energy(window, fraction < 0.5 ? low : high);
-  if (unexplained > settings.max_residual * static_cast<double>(window.value_energy))
+  if (unexplained > settings.max_residual * static_cast<double>(window.levels.energy))
     return false;
   const double noise = shift_sigma_px(window, unexplained);
   const double sigma = std::sqrt(double{settings.sigma_floor_px} * settings.sigma_floor_px +

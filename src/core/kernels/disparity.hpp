@@ -6,9 +6,11 @@
 
 namespace engram {
 
-// Both images of a rectified pair, and both halved.
+// Both images of a rectified pair, and both halved. Where the sides differ in brightness, the halved
+// ones are freed of it (even_contrast), and windows of the others are.
 struct StereoImages {
   Image left, right, left_half, right_half;
+  bool sides_differ = false;
 };
 
 struct StereoSettings {

@@ -6,12 +6,14 @@
 #include "kernels/buffer.hpp"
 #include "kernels/corners.hpp"
 #include "kernels/pyramid.hpp"
+#include "kernels/sides.hpp"
 
 namespace engram::ENGRAM_ISA {
 namespace {
 
 struct Workspace {
-  Buffer<uint8_t> left_levels[most_octaves], right_half, right_quarter, smoothed, scores;
+  Buffer<uint8_t> left_levels[most_octaves], right_half, right_quarter, smoothed, scores,
+      evened[4];
   Buffer<Corner> corners, kept;
   Buffer<int32_t> order;
   Buffer<float> measured; // four per corner: u, v, disparity, σ
@@ -34,9 +36,23 @@ inline bool inside_border(const Image &image, int64_t x, int64_t y) {
          y < image.height - corner_border;
 }
 
+// The pair as the search reads it.
+StereoImages compared(const StereoImages &images, Buffer<uint8_t> *memory) {
+  if (!images.sides_differ)
+    return images;
+  const auto evened = [](const Image &half, Buffer<uint8_t> &memory) {
+    uint8_t *pixels = memory.room_for(half.width * half.height);
+    even_contrast(half, pixels);
+    return Image{pixels, half.width, half.height};
+  };
+  return {images.left, images.right, evened(images.left_half, memory[0]),
+          evened(images.right_half, memory[1]), true};
+}
+
 // How one look at a pair finds corners and their disparities.
 struct Look {
   int32_t threshold;
+  Image left, left_half; // in which corners are found
   StereoImages images, halved; // `halved` is empty where it is not to be searched
   StereoSettings stereo, half_stereo;
 };
@@ -123,10 +139,10 @@ int64_t share_up_to(int octave, const ExtractionSettings &settings) {
 ExtractionCounts look_at(const Look &look, const ExtractionSettings &settings,
                          const ExtractedLandmarks &out, Workspace &work) {
   ExtractionCounts counts{0, 0};
-  Image level = look.images.left;
+  Image level = look.left;
   for (int octave = 0; octave < settings.octaves; ++octave) {
     if (octave == 1)
-      level = look.images.left_half;
+      level = look.left_half;
     else if (octave > 1)
       level = halved(level, work.left_levels[octave - 1]);
     const int64_t wanted = share_up_to(octave, settings) - counts.landmarks;
@@ -138,12 +154,18 @@ ExtractionCounts look_at(const Look &look, const ExtractionSettings &settings,
 
 } // namespace
 
-ExtractionCounts extract(const Image &left, const Image &right, const ExtractionSettings &settings,
-                         const ExtractedLandmarks &out) {
+ExtractionCounts extract(const Image &left, const Image &right, const Mask &mask,
+                         const ExtractionSettings &settings, const ExtractedLandmarks &out) {
   static thread_local Workspace work;
   const StereoSettings &stereo = settings.stereo;
+  const Image left_half = halved(left, work.left_levels[0]);
+  const Image right_half = halved(right, work.right_half);
+  const bool differ = settings.side_difference > 0 &&
+                      side_difference(left_half, right_half, mask, stereo.max_disparity_px) > settings.side_difference;
   Look look{settings.fast_threshold,
-            {left, right, halved(left, work.left_levels[0]), halved(right, work.right_half)},
+            left,
+            left_half,
+            compared({left, right, left_half, right_half, differ}, work.evened),
             {},
             stereo,
             at_half_size(stereo)};
@@ -151,9 +173,9 @@ ExtractionCounts extract(const Image &left, const Image &right, const Extraction
   if (first.landmarks == settings.landmarks || settings.second_threshold == 0)
     return first;
   look.threshold = settings.second_threshold;
-  look.halved = {look.images.left_half, look.images.right_half,
-                 halved(look.images.left_half, work.left_levels[1]),
-                 halved(look.images.right_half, work.right_quarter)};
+  look.halved = compared({left_half, right_half, halved(left_half, work.left_levels[1]),
+                          halved(right_half, work.right_quarter), differ},
+                         work.evened + 2);
   return look_at(look, settings, out, work);
 }
 

@@ -14,6 +14,7 @@ struct ExtractionSettings {
   int32_t octaves;   // 1 to most_octaves, each half the size of the one before
   int32_t fast_threshold, cell_px;
   int32_t second_threshold; // of the second look; 0: none
+  float side_difference; // beyond which the sides are compared free of brightness; 0: never
   StereoSettings stereo;
 };
 
@@ -40,5 +41,9 @@ ENGRAM_DECLARE_KERNELS(
     // second threshold, and what has no disparity in the images is given one in the halved images,
     // where windows are twice as large and a blur is half as wide. Drops on a lens, fog and the
     // dark leave few corners, and those are often sharp in one image only.
-    ExtractionCounts extract(const Image &left, const Image &right,
+    //
+    // Where the sides differ in brightness or contrast, disparities are measured free of both;
+    // other pairs get the same bits as without that. The mask tells what of the left image is not
+    // to be asked whether they differ.
+    ExtractionCounts extract(const Image &left, const Image &right, const Mask &mask,
                              const ExtractionSettings &settings, const ExtractedLandmarks &out);)

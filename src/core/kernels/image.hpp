@@ -12,6 +12,13 @@ struct Image {
   int64_t width, height;
 };
 
+// Of an image so large: false on what is not to be looked at, the robot's own body; null: look at
+// all of it.
+struct Mask {
+  const bool *seen;
+  int64_t width, height;
+};
+
 struct Corner {
   int16_t x, y;
   uint8_t score;

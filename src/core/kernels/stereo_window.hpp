@@ -91,22 +91,23 @@ ENGRAM_INLINE int32_t total_of(Totals totals) {
 }
 
 // Sum of absolute differences of two windows.
-ENGRAM_INLINE int sum_of_differences(const uint8_t *left, const uint8_t *right, int64_t stride) {
+ENGRAM_INLINE int sum_of_differences(const uint8_t *left, int64_t stride, const uint8_t *right,
+                                     int64_t right_stride) {
 #if defined(__SSE2__)
   __m128i sum = _mm_setzero_si128();
-  for (int row = 0; row < fine_height; ++row, left += stride, right += stride)
+  for (int row = 0; row < fine_height; ++row, left += stride, right += right_stride)
     sum = _mm_add_epi32(sum,
                         _mm_sad_epu8(_mm_loadu_si128(reinterpret_cast<const __m128i *>(left)),
                                      _mm_loadu_si128(reinterpret_cast<const __m128i *>(right))));
   return _mm_cvtsi128_si32(sum) + _mm_cvtsi128_si32(_mm_srli_si128(sum, 8));
 #elif defined(__aarch64__)
   uint16x8_t sum = vdupq_n_u16(0);
-  for (int row = 0; row < fine_height; ++row, left += stride, right += stride)
+  for (int row = 0; row < fine_height; ++row, left += stride, right += right_stride)
     sum = vpadalq_u8(sum, vabdq_u8(vld1q_u8(left), vld1q_u8(right)));
   return static_cast<int>(vaddlvq_u16(sum));
 #else
   int sum = 0;
-  for (int row = 0; row < fine_height; ++row, left += stride, right += stride)
+  for (int row = 0; row < fine_height; ++row, left += stride, right += right_stride)
     for (int column = 0; column < fine_width; ++column)
       sum += left[column] < right[column] ? right[column] - left[column]
                                           : left[column] - right[column];

@@ -138,6 +138,8 @@ def _corners(
         sigma_floor_px=config.sigma_floor_px,
         sigma_scale=config.sigma_scale,
         second_threshold=config.second_threshold,
+        side_difference=config.side_difference,
+        mask=pair.mask,
     )
     described = descriptors if with_brief else None
     return Keypoints(pixels, disparity_px, sigma_px, octaves, corners, described)

@@ -80,7 +80,8 @@ int main(int count, char **arguments) {
     read(file, left.data(), pixels);
     read(file, right.data(), pixels);
     const auto found = generic::extract(
-        {left.data(), width, height}, {right.data(), width, height}, extraction,
+        {left.data(), width, height}, {right.data(), width, height}, {nullptr, width, height},
+        extraction,
         {marks.pixels.data(), marks.disparity_px.data(), marks.sigma_px.data(),
          marks.descriptors.data(), marks.octaves.data()});
     const auto n = static_cast<size_t>(found.landmarks);

@@ -39,6 +39,7 @@ _KERNELS = [
     "pyramid",
     "disparity",
     "quantise",
+    "sides",
     "ordering",
     "matching",
     "pose",
@@ -82,7 +83,8 @@ def write_inputs(folder: Path, frames: int) -> None:
     floats = ", ".join(f"static_cast<float>({value})" for value in stereo[1:])
     lines.append(
         f"const ExtractionSettings extraction{{kLandmarks, {c.octaves}, {c.fast_threshold}, "
-        f"{c.cell_px}, {c.second_threshold}, {{{stereo[0]}, {floats}}}}};"
+        f"{c.cell_px}, {c.second_threshold}, static_cast<float>({c.side_difference}), "
+        f"{{{stereo[0]}, {floats}}}}};"
     )
     (folder / "settings.inc").write_text("\n".join(lines) + "\n", encoding="ascii")
 

@@ -11,7 +11,7 @@ from shlex import quote
 
 from engram.config import config_hash
 from engram.errors import ConfigError, SequenceError
-from engram.frontend import DescriptorKind, Frontend
+from engram.frontend import DescriptorKind
 from engram.geometry import SE3, StereoCamera
 from engram.graph.model import Session
 from engram.robot import Settings, session_of_drive
@@ -19,7 +19,7 @@ from engram.sequences import FrameLog, LoggedFrame
 from engram.sequences.trajectories import Trajectory
 from engram_lab.town import WORLD_VERSION, Campaign, Size, campaign_named
 from engram_lab.town.simulating import campaign_folder
-from engram_lab.town.upkeep import Upkeep, bring_up_to_date, first_look
+from engram_lab.town.upkeep import Upkeep, bring_up_to_date, known_frontends
 from engram_lab.truth import read_truth, truth_path
 
 
@@ -153,7 +153,7 @@ def open_campaign(
             f"{campaign.seed} --size {size.value} --out {quote(str(campaigns))}"
         )
     settings = settings or Settings()
-    drives, ours = drives_of(paths), {Frontend(settings.frontend).hash, first_look(settings)}
+    drives, ours = drives_of(paths), known_frontends(settings)
     same = [one.path for one in drives if one.frontend in ours]
     if {bring_up_to_date(path, settings) for path in same} - {Upkeep.KEPT}:
         drives = drives_of(paths)

@@ -29,8 +29,10 @@ def bring_up_to_date(path: Path, settings: Settings) -> Upkeep:
     """Rewrites a log of older odometry, or of a front-end that gives the same landmarks.
 
     Odometry is run over the landmarks again. A log of a front-end without a second look holds what
-    one with it gives, if no frame lacks landmarks; only then it becomes one of the other. The log
-    is replaced in one step; frames, hashes of images and the drive's identity stay.
+    one with it gives, if no frame lacks landmarks; only then it becomes one of the other. One of a
+    front-end that compared the sides as they are holds what is measured now: both cameras of a
+    rendered rig have one exposure. The log is replaced in one step; frames, hashes of images and
+    the drive's identity stay.
 
     Args:
         path: NAME.framelog, recorded to its end.
@@ -44,13 +46,15 @@ def bring_up_to_date(path: Path, settings: Settings) -> Upkeep:
     try:
         frontend, odometry = Frontend(settings.frontend).hash, config_hash(settings.odometry)
         outdated = False
-        if log.header.frontend not in {frontend, first_look(settings)}:
+        if log.header.frontend not in known_frontends(settings):
             raise IncompatibleError(
                 f"{path}: was rendered with another version or other settings of the front-end "
                 f"({log.header.frontend}, now {frontend}); give another --out, or remove the "
                 "folder to render anew"
             )
-        if log.header.frontend != frontend and _lacks_landmarks(log, settings):
+        looks_twice = settings.frontend.second_threshold > 0
+        once = looks_twice and log.header.frontend == first_look(settings)
+        if once and _lacks_landmarks(log, settings):
             outdated, frontend = True, log.header.frontend
         header = replace(log.header, odometry=odometry, frontend=frontend)
         if header != log.header:
@@ -63,9 +67,15 @@ def bring_up_to_date(path: Path, settings: Settings) -> Upkeep:
     return Upkeep.KEPT if header == log.header else Upkeep.REWRITTEN
 
 
+def known_frontends(settings: Settings) -> set[str]:
+    """Hashes of the front-end, and of those before it whose logs can be brought up to date."""
+    as_they_are = replace(settings.frontend, side_difference=0)
+    return {Frontend(settings.frontend).hash, Frontend(as_they_are).hash, first_look(settings)}
+
+
 def first_look(settings: Settings) -> str:
-    """Hash of the same front-end without its second look."""
-    return Frontend(replace(settings.frontend, second_threshold=0)).hash
+    """Hash of the same front-end without its second look, which compared the sides as they are."""
+    return Frontend(replace(settings.frontend, second_threshold=0, side_difference=0)).hash
 
 
 def _lacks_landmarks(log: FrameLog, settings: Settings) -> bool:
