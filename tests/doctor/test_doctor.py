@@ -174,6 +174,17 @@ def test_each_fault_is_found(pairs, fault: str) -> None:
     assert f", limit {limit})" in one.text()
 
 
+def test_an_exposure_that_hunts_on_one_side_is_no_lag(pairs) -> None:
+    bright_at = itertools.cycle([(1.0, 0.3), (1.0, 0.3), (0.3, 1.0), (0.3, 1.0)])
+    hunting = [
+        replace(one, left=brightened(one.left, left), right=brightened(one.right, right))
+        for one, (left, right) in zip(pairs, bright_at, strict=False)
+    ]
+    found = codes(examined(hunting))
+    assert "sides_exposed_differently" in found
+    assert "not_synchronised" not in found
+
+
 def test_consequences_of_swapped_sides_are_not_findings_of_their_own(pairs) -> None:
     assert codes(examined([exchanged(pair) for pair in pairs])) == {"sides_swapped"}
 

@@ -241,8 +241,8 @@ CHECKS: tuple[Check, ...] = (
     Check(
         "sides_exposed_differently", _WARNING, pictures.exposure_difference,
         "exposure_difference", "factors of two",
-        "left and right differ in brightness",
-        "let one camera control the exposure of both",
+        "left and right differ in brightness: the darker one measures with fewer grey levels",
+        "clean both lenses, and let one camera control the exposure of both",
     ),
     Check(
         "blurred", _WARNING, pictures.sharpness, "sharpness", "",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import compress
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engram.doctor.examination import Array, Evidence
 from engram.doctor.sides import Alignment, align, rows_off
@@ -25,6 +26,8 @@ _MOST_LATE = 5
 _CLEARER = 0.25
 _LEAST_STEPS = 15
 _AT_REST_M = 0.02
+# Added to the spread of the rows, grey levels: in the dark there is only noise.
+_LEAST_SPREAD = 1.0
 # A pair shows a way forwards beyond this many standard deviations.
 _SIGNIFICANT = 4.0
 
@@ -81,8 +84,7 @@ def frames_late(seen: Evidence) -> float | None:
     rests = seen.moved_m < _AT_REST_M
     if sum(map(_aside, compress(seen.moved, ~rests))) > 0.5 * np.count_nonzero(~rests):
         return None
-    change = np.diff([one.rows for one in seen.looks], axis=0)
-    change -= change.mean(axis=2, keepdims=True)  # exposure
+    change = np.diff([_unexposed(one.rows) for one in seen.looks], axis=0)
     change[np.array(seen.first[1:], np.bool_) | rests[1:]] = 0
     if np.count_nonzero(change.any(axis=(1, 2))) < _LEAST_STEPS:
         return None
@@ -124,6 +126,12 @@ def row_offset_px(seen: Evidence) -> float | None:
 
 def _aside(moved: SE3 | None) -> bool:
     return moved is not None and bool(abs(moved.translation[0]) > abs(moved.translation[2]))
+
+
+def _unexposed(rows: NDArray[np.float32]) -> Array:
+    """Rows (2, R) of each side free of its exposure, which may change on its own."""
+    spread = rows.std(axis=1, keepdims=True)
+    return np.asarray((rows - rows.mean(axis=1, keepdims=True)) / (spread + _LEAST_SPREAD))
 
 
 def _alike(ahead: Array, behind: Array, lag: int) -> float:
