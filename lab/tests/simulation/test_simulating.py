@@ -121,6 +121,18 @@ def test_logs_without_a_second_look_stay_where_none_would_be_taken(
     assert contents(report.files[0]) == contents(wanted)
 
 
+@pytest.mark.long
+def test_logs_of_before_sides_were_compared_stay(short: Campaign, tmp_path: Path) -> None:
+    """Both cameras of a rendered rig have one exposure: nothing is measured otherwise."""
+    near = replace(short, spacing_m=2.5, sessions=short.sessions[:1])
+    before = Settings(frontend=FrontendConfig(side_difference=0))
+    simulate(near, tmp_path / "old", settings=before)
+    report = simulate(near, tmp_path / "old")
+    assert (report.rendered, report.already_there) == (0, 1)
+    (wanted,) = simulate(near, tmp_path / "new").files
+    assert contents(report.files[0]) == contents(wanted)
+
+
 def contents(file: str) -> list[tuple[object, ...]]:
     """The header of a frame log and all its frames."""
     log = FrameLog(file)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from engram.config import config_hash
 from engram.errors import IncompatibleError
-from engram.frontend import Frontend
+from engram.frontend import Frontend, FrontendConfig
 from engram.monitor import write_whole
 from engram.odometry import Odometry
 from engram.robot import Settings
@@ -53,7 +53,7 @@ def bring_up_to_date(path: Path, settings: Settings) -> Upkeep:
                 "folder to render anew"
             )
         looks_twice = settings.frontend.second_threshold > 0
-        once = looks_twice and log.header.frontend == first_look(settings)
+        once = looks_twice and log.header.frontend in _looking_once(settings)
         if once and _lacks_landmarks(log, settings):
             outdated, frontend = True, log.header.frontend
         header = replace(log.header, odometry=odometry, frontend=frontend)
@@ -69,13 +69,17 @@ def bring_up_to_date(path: Path, settings: Settings) -> Upkeep:
 
 def known_frontends(settings: Settings) -> set[str]:
     """Hashes of the front-end, and of those before it whose logs can be brought up to date."""
-    as_they_are = replace(settings.frontend, side_difference=0)
-    return {Frontend(settings.frontend).hash, Frontend(as_they_are).hash, first_look(settings)}
+    return _frontends(settings.frontend) | _looking_once(settings)
 
 
-def first_look(settings: Settings) -> str:
-    """Hash of the same front-end without its second look, which compared the sides as they are."""
-    return Frontend(replace(settings.frontend, second_threshold=0, side_difference=0)).hash
+def _looking_once(settings: Settings) -> set[str]:
+    """Of the same front-end without its second look."""
+    return _frontends(replace(settings.frontend, second_threshold=0))
+
+
+def _frontends(config: FrontendConfig) -> set[str]:
+    """Of a front-end, and of that which compared the sides as they are."""
+    return {Frontend(one).hash for one in (config, replace(config, side_difference=0))}
 
 
 def _lacks_landmarks(log: FrameLog, settings: Settings) -> bool:
