@@ -297,7 +297,7 @@ def altered(key: str, value: Any) -> tuple[AllSettings, Any]:
 EVERY = {one.key: one.value for one in every_setting(AllSettings())}
 HELD_OUT = ("localiser", "gaps")
 IN_LOGS = ("frontend", "odometry")
-IN_MAPS = ("localiser", "mapper", "doctor", "outside", "gaps", "placing")
+IN_MAPS = ("localiser", "mapper", "doctor", "outside", "gaps", "fixed", "frozen", "placing")
 MADE_ONCE = ("localiser.lost_max_samples", "localiser.lost_max_hypotheses")
 
 
