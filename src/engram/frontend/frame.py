@@ -87,6 +87,8 @@ class Frame:
         status: `FrameStatus.OK`, or why the frame is unusable.
         thumbnail: (h, w) uint8 grey, at most 160 px wide, for people to look at; None if not
             loaded.
+        left_out: landmarks that were left out as they move with the camera: what is left is no
+            better evidence than before.
     """
 
     stamp_ns: int
@@ -96,3 +98,4 @@ class Frame:
     frontend: str
     status: FrameStatus
     thumbnail: NDArray[np.uint8] | None = None
+    left_out: int = 0

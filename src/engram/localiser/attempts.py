@@ -317,7 +317,7 @@ class Attempter:
         spreads = (in_reach if unproved else weak) and match.inliers >= _LEAST_WEIGHED
         return Evidence(
             match.inliers,
-            match.inliers / len(live.landmarks),
+            match.inliers / (len(live.landmarks) + live.left_out),
             pose.distance_m,
             math.sqrt(x_m2 + y_m2 + z_m2),
             candidate.standing,

@@ -492,7 +492,7 @@ class FixedPixels:
             # Its edges, which get few votes, are as far away as the thing itself.
             off_px = np.abs(frame.landmarks.disparity_px - self._around_px[rows, columns])
             clear &= off_px > self._config.same_disparity_px
-        return _some(frame, clear)
+        return replace(_some(frame, clear), left_out=int(np.count_nonzero(~clear)))
 
 
 def kept_rows(before: Frame, now: Frame, config: FixedConfig | None = None) -> NDArray[np.int32]:
