@@ -14,9 +14,9 @@ from engram_lab.town.conditions import WEATHERS, Conditions
 from engram_lab.town.drive import driving_line
 from engram_lab.town.noise import NoiseFields
 from engram_lab.town.sky import sun_direction
-from engram_lab.town.streets import crossing_loops, loop_of_length
+from engram_lab.town.streets import Fronts, Unique, crossing_loops, equal_rings, loop_of_length
 from engram_lab.town.textures import Style, facade
-from engram_lab.town.town import _Side, _slide_m
+from engram_lab.town.town import Today, Town, _Side, _slide_m, _TileBuilder
 
 
 @given(st.floats(100, 8000), st.integers(0, 2**31 - 1))
@@ -161,3 +161,57 @@ def test_no_end_wall_stands_before_the_fronts_round_the_corner(block: tuple[int,
             back = end - 8.5 * side.outwards + _slide_m(side, other, 8.5) * side.along
             # A pane lies 0.16 m behind its wall: the end wall is farther back from 0.6 m on.
             assert (back - end) @ other.outwards / 8.5 < -0.25
+
+
+def estate_tile(fronts: Fronts, block: tuple[int, int]) -> _TileBuilder:
+    plan, route = equal_rings(fronts, 5)
+    builder = _TileBuilder(Town(plan, route, Style()), block, Today(1, 9.0, 0, 0.5))
+    builder.build()
+    return builder
+
+
+@pytest.mark.parametrize(
+    ("fronts", "same_fronts", "same_things"),
+    [
+        (Fronts(30.0, unique=frozenset({Unique.THINGS, Unique.CARS})), True, False),
+        (Fronts(30.0, unique=frozenset({Unique.CARS})), True, True),
+        (Fronts(30.0, equal=0.0, unique=frozenset()), False, True),
+    ],
+)
+def test_fronts_of_an_estate_are_the_same_around_each_block_and_the_rest_as_asked(
+    fronts: Fronts, same_fronts: bool, same_things: bool
+) -> None:
+    meshes = []
+    for block in ((0, 0), (0, 2)):
+        tile = estate_tile(fronts, block)
+        offset = [*(np.array(block) * fronts.spacing_m), 0.0]
+        meshes.append([part.build().vertices - offset for part in (tile.solid, tile.green)])
+    (walls, trees), (other_walls, other_trees) = meshes
+    assert (len(trees) == len(other_trees) and np.allclose(trees, other_trees, atol=1e-3)) is (
+        same_things
+    )
+    shared = {tuple(row) for row in np.round(walls.reshape(len(walls), -1), 2).tolist()}
+    other = {tuple(row) for row in np.round(other_walls.reshape(len(other_walls), -1), 2).tolist()}
+    assert (len(shared & other) > 0.8 * min(len(shared), len(other))) is same_fronts
+
+
+def test_the_rings_of_an_estate_share_no_street_and_are_whole_periods_apart() -> None:
+    for period_m in (20.0, 30.0, 37.5):
+        plan, route = equal_rings(Fronts(period_m), 5)
+        assert route.beside is not None
+        assert not set(route.beside.streets()) & (
+            set(route.streets()) - set(route.beside.streets())
+        )
+        assert plan.spacing_m % period_m == 0
+        assert driving_line(plan, route, reverse=False).length_m == pytest.approx(
+            driving_line(plan, route.beside, reverse=False).length_m
+        )
+
+
+def test_estates_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ConfigError, match="period is 5"):
+        Fronts(5.0)
+    with pytest.raises(ConfigError, match=r"share of equal fronts is 1\.5"):
+        Fronts(20.0, 1.5)
+    with pytest.raises(ConfigError, match="'lamps' is unknown; known: road, things, cars"):
+        Unique.named("road,lamps")

@@ -84,7 +84,8 @@ def simulate(
     campaign: Annotated[
         str,
         typer.Argument(
-            metavar="CAMPAIGN", help="hamlet, village, begbroke, keble, oxford or begbroke24h."
+            metavar="CAMPAIGN",
+            help="hamlet, village, begbroke, keble, oxford, begbroke24h or estate.",
         ),
     ],
     *,
@@ -107,6 +108,16 @@ def simulate(
     workers: Annotated[
         int, typer.Option("--workers", metavar="N", min=1, help="Processes on this machine.")
     ] = 2,
+    period: Annotated[
+        float, typer.Option("--period", metavar="M", help="estate: way after which fronts repeat.")
+    ] = 37.5,
+    equal: Annotated[
+        float, typer.Option("--equal", metavar="SHARE", help="estate: share of equal fronts.")
+    ] = 1.0,
+    unique: Annotated[
+        str,
+        typer.Option("--unique", metavar="WHAT,…", help="estate: what differs between streets."),
+    ] = "road,things,cars",
     config: options.Settings = None,
     as_json: options.Json = False,
 ) -> None:
@@ -123,10 +134,14 @@ def simulate(
     from engram.cli.settings import read_settings
     from engram_lab.cli.lists import numbers
     from engram_lab.town import Size, campaign_named
+    from engram_lab.town.campaigns import estate
     from engram_lab.town.simulating import campaigns_folder
     from engram_lab.town.simulating import simulate as render
+    from engram_lab.town.streets import Fronts, Unique
 
     chosen = campaign_named(campaign, seed, Size.named(size))
+    if campaign == "estate":
+        chosen = estate(seed, chosen.size, Fronts(period, equal, Unique.named(unique)))
     wanted = None if sessions is None else numbers(sessions, "--sessions")
     report = render(
         chosen,

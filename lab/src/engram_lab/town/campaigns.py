@@ -12,7 +12,14 @@ import numpy as np
 from engram.errors import ConfigError
 from engram_lab.town.camera_model import CLEAN, Lens
 from engram_lab.town.conditions import OXFORD, Place
-from engram_lab.town.streets import Route, StreetPlan, crossing_loops, loop_of_length
+from engram_lab.town.streets import (
+    Fronts,
+    Route,
+    StreetPlan,
+    crossing_loops,
+    equal_rings,
+    loop_of_length,
+)
 
 # Raised whenever a frame of any campaign changes: rendered data is kept by it.
 WORLD_VERSION = 5
@@ -52,6 +59,7 @@ class SessionPlan:
         reverse: driven the other way round.
         seed: of the driving line, the noise, the traffic and the clouds.
         lens: what is wrong with the front lens.
+        beside: driven along the route beside the campaign's.
     """
 
     number: int
@@ -61,11 +69,12 @@ class SessionPlan:
     reverse: bool
     seed: int
     lens: Lens = CLEAN
+    beside: bool = False
 
     @property
     def name(self) -> str:
         """Such as ``007-0812T0930-overcast-wildcat``."""
-        way = "-reverse" if self.reverse else ""
+        way = ("-reverse" if self.reverse else "") + ("-beside" if self.beside else "")
         return f"{self.number:03d}-{self.start:%m%dT%H%M}-{self.weather}-{self.robot}{way}"
 
 
@@ -86,6 +95,7 @@ class Campaign:
         parked_share: of the parking places that are taken.
         spacing_m: way between frames.
         place: where on earth.
+        fronts: how the fronts repeat; None where each is unique.
         first_day: from which structural change counts.
     """
 
@@ -100,6 +110,7 @@ class Campaign:
     parked_share: float = 0.45
     spacing_m: float = 0.7
     place: Place = OXFORD
+    fronts: Fronts | None = None
 
     @property
     def first_day(self) -> int:
@@ -110,6 +121,8 @@ class Campaign:
 
     def plan(self) -> tuple[StreetPlan, Route]:
         """Where its streets run and the way that is driven."""
+        if self.fronts is not None:
+            return equal_rings(self.fronts, self.seed)
         return (crossing_loops if self.crossing else loop_of_length)(self.length_m, self.seed)
 
     def session(self, number: int) -> SessionPlan:
@@ -273,6 +286,33 @@ def _oxford(seed: int, size: Size) -> Campaign:
     return Campaign("oxford", seed, length, False, sessions, 0.9, size, "oxford", 0.65)
 
 
+def estate(seed: int, size: Size = Size.STANDARD, fronts: Fronts | None = None) -> Campaign:
+    """Rings between equal fronts, one of them mapped, the other one beside it.
+
+    Args:
+        seed: of the town.
+        size: makes no difference.
+        fronts: how they repeat; None for every 37.5 m.
+    """
+    fronts, first = fronts or Fronts(), datetime(2025, 7, 14, tzinfo=UTC)
+    drives = [
+        (0, 8.5, "clear", False), (1, 11.0, "overcast", False), (1, 12.0, "overcast", True),
+        (2, 9.0, "clear", True), (3, 17.0, "fair", False), (3, 22.5, "fair", True),
+        (4, 10.0, "rain", True), (4, 23.0, "fair", False),
+    ]  # fmt: skip
+    starts = [first + timedelta(days=d, hours=h) for d, h, _, _ in drives]
+    count = len(drives)
+    sessions = _planned(
+        "estate", seed, starts, [d[2] for d in drives], ["wildcat"] * count, [False] * count
+    )
+    sessions = tuple(
+        replace(plan, beside=drive[3]) for plan, drive in zip(sessions, drives, strict=True)
+    )
+    length_m = 6 * fronts.spacing_m
+    name = f"estate-{fronts.name}"
+    return Campaign(name, seed, length_m, False, sessions, 0.2, size, name, fronts=fronts)
+
+
 CAMPAIGNS: dict[str, Callable[[int, Size], Campaign]] = {
     "hamlet": _hamlet,
     "village": _village,
@@ -280,4 +320,5 @@ CAMPAIGNS: dict[str, Callable[[int, Size], Campaign]] = {
     "keble": _keble,
     "oxford": _oxford,
     "begbroke24h": _begbroke24h,
+    "estate": estate,
 }

@@ -58,7 +58,9 @@ class SimulatedDrive:
         self._stage: TownRenderer | None = None
         self._life: Life | None = None
         self._streets, self._route = campaign.plan()
-        self.line: Line = driving_line(self._streets, self._route, self.plan.reverse)
+        beside = self._route.beside if self.plan.beside else None
+        self._driven = beside or self._route
+        self.line: Line = driving_line(self._streets, self._driven, self.plan.reverse)
         count = int(self.line.length_m // campaign.spacing_m)
         style = DrivingStyle(self.plan.seed)
         self.poses: list[Pose] = drive(self.line, self.robot, style, campaign.spacing_m, count)
@@ -123,7 +125,7 @@ class SimulatedDrive:
     def _moving(self, pose: Pose) -> Mesh:
         if self._life is None:
             self._life = Life(
-                _town(self._streets, self._route).cast, self._streets, self._route, self.line,
+                _town(self._streets, self._route).cast, self._streets, self._driven, self.line,
                 self.plan.reverse, self.campaign.traffic, self.plan.seed,
             )  # fmt: skip
         position = pose.world_from_cam.translation[:2]

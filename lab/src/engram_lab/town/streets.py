@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,64 @@ Junction = tuple[int, int]
 Street = tuple[Junction, Junction]  # the smaller first
 
 _BENDS = 2  # points of a street between its junctions
+_BLOCK_M = 75.0  # longest block of a town whose fronts repeat
+_STRAIGHT_HALF_WIDTH_M = 4.6
+
+
+class Unique(StrEnum):
+    """What differs from street to street where the fronts do not."""
+
+    ROAD = "road"
+    THINGS = "things"
+    CARS = "cars"
+
+    @classmethod
+    def named(cls, text: str) -> frozenset[Unique]:
+        """Several, joined by commas.
+
+        Raises:
+            ConfigError: one of them is unknown.
+        """
+        names = [name for name in text.split(",") if name]
+        for name in names:
+            if name not in list(cls):
+                raise ConfigError(f"unique part {name!r} is unknown; known: {', '.join(cls)}")
+        return frozenset(map(cls, names))
+
+
+@dataclass(frozen=True, slots=True)
+class Fronts:
+    """Fronts that repeat along straight streets, as in an estate.
+
+    Attributes:
+        period_m: way after which they do, metres.
+        equal: share of the houses that are copies; the others are each unique.
+        unique: what else is unique: tarmac and pavement, with its width; trees, signs and benches; parked cars.
+            The rest is the same around each block.
+
+    Raises:
+        ConfigError: the period is outside 10 to 75 m, or the share outside 0 to 1.
+    """
+
+    period_m: float = 37.5
+    equal: float = 1.0
+    unique: frozenset[Unique] = frozenset(Unique)
+
+    def __post_init__(self) -> None:
+        if not 10 <= self.period_m <= _BLOCK_M:
+            raise ConfigError(f"period is {self.period_m} m, must be 10 to {_BLOCK_M:g} m")
+        if not 0 <= self.equal <= 1:
+            raise ConfigError(f"share of equal fronts is {self.equal}, must be 0 to 1")
+
+    @property
+    def name(self) -> str:
+        """Such as ``37.5m-1-cars+road+things``."""
+        return f"{self.period_m:g}m-{self.equal:g}-{'+'.join(sorted(self.unique)) or 'nothing'}"
+
+    @property
+    def spacing_m(self) -> float:
+        """Distance between junctions: as many whole periods as a block of 75 m has."""
+        return self.period_m * int(_BLOCK_M / self.period_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,13 +88,18 @@ class StreetPlan:
     Attributes:
         seed: of the town.
         spacing_m: mean distance between junctions.
+        fronts: how the fronts repeat, along straight streets of one width; None where each is
+            unique.
     """
 
     seed: int
     spacing_m: float
+    fronts: Fronts | None = None
 
     def junction(self, at: Junction) -> Points:
         """Position (2,) of a junction, metres."""
+        if self.fronts is not None:
+            return np.array(at) * self.spacing_m
         rng = self.rng("junction", at)
         jitter = min(7.0, 0.09 * self.spacing_m)
         return np.array(at) * self.spacing_m + rng.uniform(-jitter, jitter, 2)
@@ -49,11 +113,15 @@ class StreetPlan:
         along = b - a
         across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
         bend_m = rng.uniform(-0.05, 0.05, _BENDS) * self.spacing_m
+        if self.fronts is not None:
+            bend_m = np.zeros(_BENDS)
         inner = [a + along * (k + 1) / (_BENDS + 1) + across * bend_m[k] for k in range(_BENDS)]
         return np.array([a, *inner, b])
 
     def half_width_m(self, start: Junction, end: Junction) -> float:
         """Half the width of a street between its kerbs."""
+        if self.fronts is not None:
+            return _STRAIGHT_HALF_WIDTH_M
         first, last = min(start, end), max(start, end)
         widths = (3.6, 4.6, 5.0) if self.spacing_m > 45 else (3.6, 4.6)
         return float(self.rng("width", first, last).choice(widths))
@@ -99,15 +167,27 @@ def _inset(outline: Points, offsets_m: Points) -> Points:
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """A closed drive: the junctions it passes, in order; the first follows the last."""
+    """A closed drive.
+
+    Attributes:
+        junctions: that it passes, in order; the first follows the last.
+        beside: another drive, along whose streets the town is made as finely.
+    """
 
     junctions: tuple[Junction, ...]
+    beside: Route | None = None
 
     def streets(self) -> Iterator[Street]:
-        """The streets it uses, in order, each with its smaller junction first."""
+        """The streets it uses, in order, each with its smaller junction first; those beside."""
         for k, start in enumerate(self.junctions):
             end = self.junctions[(k + 1) % len(self.junctions)]
             yield (min(start, end), max(start, end))
+        if self.beside is not None:
+            yield from self.beside.streets()
+
+    def all_junctions(self) -> tuple[Junction, ...]:
+        """Its own junctions, and those beside."""
+        return self.junctions + (() if self.beside is None else self.beside.all_junctions())
 
 
 def loop_of_length(length_m: float, seed: int) -> tuple[StreetPlan, Route]:
@@ -122,6 +202,16 @@ def loop_of_length(length_m: float, seed: int) -> tuple[StreetPlan, Route]:
     count = max(4, 2 * round(length_m / 70 / 2))
     plan = StreetPlan(seed, length_m / count)
     return plan, Route(_ring(count, np.random.default_rng([seed, 0x10F])))
+
+
+def equal_rings(fronts: Fronts, seed: int) -> tuple[StreetPlan, Route]:
+    """A plan whose fronts repeat, a ring round two blocks, and another one beside it.
+
+    The two share no street; one block lies between them.
+    """
+    ring = ((0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (0, 1))
+    other = tuple((i, j + 2) for i, j in ring)
+    return StreetPlan(seed, fronts.spacing_m, fronts), Route(ring, Route(other))
 
 
 def crossing_loops(length_m: float, seed: int) -> tuple[StreetPlan, Route]:

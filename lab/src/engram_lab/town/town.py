@@ -31,7 +31,7 @@ from engram_lab.town.furniture import (
 from engram_lab.town.life import Cast
 from engram_lab.town.mesh import Kind, Mesh, MeshBuilder, SurfaceFlag
 from engram_lab.town.noise import NoiseFields
-from engram_lab.town.streets import Junction, Points, Route, StreetPlan
+from engram_lab.town.streets import Fronts, Junction, Points, Route, StreetPlan, Unique
 from engram_lab.town.textures import (
     Facade,
     Style,
@@ -46,6 +46,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 _COARSE_PER_M = 20  # texels of fronts that are only seen from afar
 _POOL = 16  # distinct coarse fronts
 _DEPTH_M = 8.5  # of terraced houses
+_PAVEMENT_M = 2.6  # where all are alike
 _BEHIND = 0.3  # how fast an end wall falls back behind the fronts round the corner, metres a metre
 _SHARED_STREET_M = 24.0  # after which the tarmac of side streets repeats
 
@@ -113,6 +114,12 @@ def _slide_m(side: _Side, other: _Side, depth_m: float) -> float:
     return -depth_m * over / across if abs(across) > 0.3 and over > 0 else 0.0
 
 
+def _row_widths(rng: np.random.Generator, period_m: float) -> list[float]:
+    """Widths of houses side by side that fill a period, metres."""
+    shares = rng.uniform(6.2, 10.0, max(1, round(period_m / 8.0)))
+    return [float(width) for width in shares * period_m / shares.sum()]
+
+
 def _level(point: Points, height_m: float = KERB_M) -> Points:
     return np.array([point[0], point[1], height_m])
 
@@ -151,7 +158,10 @@ class Town:
         self.cast = Cast.of_seed(self.materials, plan.seed)
         self._driven = set(route.streets())
         near = {
-            (a + i, b + j) for a, b in route.junctions for i in range(-3, 3) for j in range(-3, 3)
+            (a + i, b + j)
+            for a, b in route.all_junctions()
+            for i in range(-3, 3)
+            for j in range(-3, 3)
         }
         self._blocks = np.array(sorted(near))  # that are built at all
         self._pool = [
@@ -172,7 +182,7 @@ class Town:
     def _add_country(self) -> None:
         """Meadows to the horizon, below everything else."""
         builder = MeshBuilder()
-        middle = np.mean([self.plan.junction(at) for at in self.route.junctions], axis=0)
+        middle = np.mean([self.plan.junction(at) for at in self.route.all_junctions()], axis=0)
         corners = [middle + 3000.0 * np.array(c) for c in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
         uv = [tuple(c / 40) for c in corners]
         flat = [_level(c, -0.06) for c in corners]
@@ -227,9 +237,13 @@ class _TileBuilder:
     def build(self) -> Tile:
         """All parts, in a fixed order so that the same seed gives the same block."""
         pavement_m = 2.4 if self.plan.spacing_m < 45 else float(self.rng.choice([2.6, 3.2]))
+        if self.plan.fronts is not None and Unique.ROAD not in self.plan.fronts.unique:
+            pavement_m = _PAVEMENT_M
         kerb = self.plan.block_outline(self.block, 0.0)
         front = self.plan.block_outline(self.block, pavement_m)
         sides = self._sides(kerb, front)
+        if self.plan.fronts is not None:
+            return self._build_estate(self.plan.fronts, kerb, front, pavement_m)
         self._add_carriageways()
         self._add_pavement(sides, pavement_m)
         character = self.plan.rng("use", self.block).random()
@@ -244,6 +258,42 @@ class _TileBuilder:
         self._add_street_things(sides)
         self._park_cars(sides)
         return self._hand_over()
+
+    def _build_estate(self, fronts: Fronts, kerb: Points, front: Points, pavement_m: float) -> Tile:
+        """A block of an estate: each subject draws from a generator of its own."""
+        sides = self._sides(kerb, front)
+        self.rng = self._drawing(fronts, Unique.ROAD)
+        self._add_carriageways()
+        self._add_pavement(sides, pavement_m)
+        self._add_rows(fronts, kerb, front)
+        self.rng = self._drawing(fronts, Unique.THINGS)
+        self._add_street_things(sides)
+        self.rng = self._drawing(fronts, Unique.CARS)
+        self._park_cars(sides)
+        return self._hand_over()
+
+    def _drawing(self, fronts: Fronts, subject: Unique) -> np.random.Generator:
+        """What draws a subject: the block's own generator where it is unique."""
+        return self.plan.rng(subject, *([self.block] if subject in fronts.unique else []))
+
+    def _add_rows(self, fronts: Fronts, kerb: Points, front: Points) -> None:
+        """Fronts along all four sides, the same after each period."""
+        self._add_lawn(front, self.materials.grass, 0.2)
+        corners = [(kerb[k], front[k]) for k in (0, 3, 6, 9)]
+        junctions = [side.start for side in self._sides(kerb, front)[::3]]
+        own = self.plan.rng("fronts", self.block)
+        widths = _row_widths(self.plan.rng("widths"), fronts.period_m)
+        for k in range(4):
+            (kerb_a, a), (kerb_b, b) = corners[k], corners[(k + 1) % 4]
+            side = _Side(junctions[k], junctions[(k + 1) % 4], (kerb_a, kerb_b), (a, b))
+            at, number = 0.0, 0
+            while side.length_m - at > 4.0:
+                kind = number % len(widths)
+                width = min(widths[kind], side.length_m - at)
+                copied = own.random() < fronts.equal
+                self.rng = self.plan.rng("row", (kind, 0)) if copied else own
+                self._add_house(side, at, width, 0.0, _DEPTH_M)
+                at, number = at + width, number + 1
 
     def _hand_over(self) -> Tile:
         scene = self.town.scene
