@@ -48,7 +48,8 @@ class Standing:
         agreed: number of fixes in a row that agreed with the position before them.
         missed: expected number of fixes since the last one, had the position been right: the sum
             of the session's rates of success.
-        usual_inliers: median of the session's last fixes; 0 before the first.
+        usual_inliers: median of the session's last fixes, none counted for more than its node has
+            in common with its neighbour; 0 before the first.
         tracked: landmarks that odometry tracked to this frame, over the median at these fixes: what
             is left where drops on the lens, rain or dark hide the rest. 1 at most, or if unknown.
     """

@@ -50,6 +50,7 @@ from engram.localiser.settings import (
     Success,
 )
 from engram.localiser.tried import Tried
+from engram.localiser.yardstick import Likeness, Run, Yardstick, is_measured
 from engram.odometry import UNMOVED, Motion, OdometryStatus
 from engram.processes import cores
 from engram.ranking import (
@@ -111,6 +112,8 @@ class Localiser:
         lanes = min(budget.lanes, threads or budget.lanes) if cores() > 1 else 1
         self._attempter = Attempter(known.frames, self.config, matcher, lanes)
         self._prover = Prover(known.graph, self.config.acceptance)
+        self._yardstick = Yardstick(known.graph, self._attempter.frame, self.config.matcher)
+        self._run = Run(self.config.lookalikes)
         self._hypotheses = Hypotheses(
             known.graph,
             self._nodes_near,
@@ -236,6 +239,7 @@ class Localiser:
             said: whether somebody says so, who may be wrong where the robot knew its place.
         """
         self._prover.forget(agreed, told_otherwise=said and self.certain)
+        self._run.begin()
         self._track.set(position)
         if open_loop_m is not None:
             self._open_loop_m = open_loop_m
@@ -258,6 +262,7 @@ class Localiser:
         """Discards the position: the robot was restarted or carried elsewhere."""
         self._track.set(None)
         self._prover.forget()
+        self._run.begin()
         self._hypotheses.forget()
         if self._relocaliser is not None:
             self._relocaliser.forget()
@@ -333,7 +338,7 @@ class Localiser:
             if self.config.success is Success.FIRST:
                 outcomes, beyond = split_at_first_success(outcomes)
                 self._beyond = [one for one in beyond if not one.damaged]
-            outcomes = self._judged(live, outcomes)
+            outcomes = self._believed(live, self._judged(live, outcomes))
             clock.lap("attempts")
             self._tried.add(live, self._driven_m, self._near, outcomes)
         success = self._conclude(live, outcomes, keeper.alone_m())
@@ -568,6 +573,35 @@ class Localiser:
         confirms = confidence_of(live.descriptor).witness
         return uncontested(self._hypotheses.judge(readable, confirms), acceptance)
 
+    def _believed(self, live: Frame, outcomes: list[Outcome]) -> list[Outcome]:
+        """The same outcomes, none accepted while the run of matches may be one of look-alikes."""
+        best = best_success(outcomes, self.config.acceptance.rule)
+        if best is None or not self._tells_lookalikes(live):
+            return outcomes
+        predicted = best.evidence is not None and math.isfinite(best.evidence.apart)
+        if self._run.believed and not predicted:
+            self._run.begin()
+        if self._run.due(self._driven_m):
+            likeness = self._likeness(live, best)
+            if likeness is not None:
+                self._run.add(likeness, self._driven_m)
+        if self._run.believed:
+            return outcomes
+        return [replace(one, accepted=False) if one.accepted else one for one in outcomes]
+
+    def _tells_lookalikes(self, live: Frame) -> bool:
+        by_confidence = self.config.acceptance.rule is Rule.CONFIDENCE
+        return by_confidence and self.config.lookalikes.doubt > 0 and is_measured(live.descriptor)
+
+    def _likeness(self, live: Frame, found: Outcome) -> Likeness | None:
+        """What the match shows; None where its node's drive saved no other beside it."""
+        usual = self._yardstick.usual(found.candidate.index)
+        reference = self._attempter.frame(found.candidate.node)
+        if usual is None or reference is None:
+            return None
+        tracked = self._motion.odometry.inliers
+        return Likeness.of(found.match, reference, live, usual, tracked)
+
     def _without_damaged(self, outcomes: list[Outcome]) -> list[Outcome]:
         """Outcomes of readable nodes; the others are reported, and not attempted again."""
         damaged = [outcome.candidate for outcome in outcomes if outcome.damaged]
@@ -577,7 +611,15 @@ class Localiser:
 
     def _settle(self, live: Frame, success: Outcome, alone_m: float) -> None:
         """Sets the position to (n, ``T_n_q``) and the open loop to 0 (method §3.3)."""
-        self._prover.prove(live, success, self.position, alone_m, certain=self.certain)
+        usual = self._yardstick.usual(success.candidate.index)
+        self._prover.prove(
+            live,
+            success,
+            self.position,
+            alone_m,
+            certain=self.certain,
+            usual=None if usual is None else usual.inliers,
+        )
         leans = self._prover.leans(live, success, certain=self.certain)
         self._track.fix(success.position, leans=leans)
         self._open_loop_m = 0.0
@@ -594,7 +636,7 @@ class Localiser:
     @property
     def on_trial(self) -> bool:
         """Whether the last fixes may still be withdrawn: no edge should rest on them yet."""
-        return self._prover.on_trial
+        return self._prover.on_trial or not self._run.proved
 
     def _result(
         self,

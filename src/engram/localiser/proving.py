@@ -92,6 +92,7 @@ class Prover:
         alone_m: float = 0.0,
         *,
         certain: bool,
+        usual: int | None = None,
     ) -> None:
         """Checks a fix against those before it; the weaker of two that contradict goes.
 
@@ -102,6 +103,8 @@ class Prover:
             alone_m: way that what the drive saved has hung on nothing, metres: a fix that nothing
                 predicts joins it to the map.
             certain: whether odometry since the last match had only short gaps.
+            usual: inliers that the node has with its neighbour; None if unknown. A robot that
+                meets a node where it was saved has more, and need not have them elsewhere.
         """
         evidence, found = success.evidence, success.position
         assert evidence is not None
@@ -118,7 +121,8 @@ class Prover:
         else:
             self._chain.join(live.stamp_ns, found, alone)
         self._told = self.told_otherwise = False
-        self._record.fixed(success.match.inliers, agrees=fits is True)
+        inliers = success.match.inliers
+        self._record.fixed(inliers if usual is None else min(inliers, usual), agrees=fits is True)
 
     def leans(self, live: Frame, success: Outcome, *, certain: bool) -> bool:
         """Whether a fix is weak, and a position that earlier ones had confirmed predicted it.

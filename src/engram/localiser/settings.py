@@ -17,12 +17,13 @@ from engram.graph.basin import BasinConfig
 from engram.graph.model import PathEntryKind
 from engram.graph.paths import ALL_KINDS, MATCHES_ONLY
 from engram.localiser.acceptance import AcceptanceConfig
+from engram.localiser.yardstick import LookalikeConfig
 from engram.ranking import RecentConfig
 from engram.ranking.lessons import LessonsConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 20
+METHOD_VERSION = 21
 
 
 class NeighbourhoodSearch(StrEnum):
@@ -122,6 +123,7 @@ class LocaliserConfig:
         hypotheses: how weak matches of a lost robot are confirmed.
         basin, lessons: what the map's attempts say of distance, and of each node.
         matcher, acceptance: settings of the two halves of an attempt.
+        lookalikes: how runs of look-alikes are told.
     """
 
     search_radius_m: float = 8.0
@@ -190,6 +192,7 @@ class LocaliserConfig:
     lessons: LessonsConfig = field(default_factory=LessonsConfig)
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     acceptance: AcceptanceConfig = field(default_factory=AcceptanceConfig)
+    lookalikes: LookalikeConfig = field(default_factory=LookalikeConfig)
 
     def __post_init__(self) -> None:
         for one in fields(self):

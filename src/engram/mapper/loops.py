@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from engram.errors import ConfigError
 from engram.frontend import Frame
+from engram.frontend.matching import Match
 from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, NodeId
@@ -34,6 +35,7 @@ from engram.localiser import (
     spread,
 )
 from engram.localiser.attempts import Attempter, Candidate
+from engram.localiser.yardstick import Likeness, Yardstick, is_measured
 from engram.places.book import PlaceBook
 
 # Most likely places, from which those to attempt are chosen apart from each other.
@@ -59,6 +61,8 @@ class LoopConfig:
         confirm_within_m: distance beyond it after which an unconfirmed match is dropped, metres.
         certain_m: largest standard deviation of the path between two matches that confirm each
             other, metres.
+        proof: mean log-odds that two matches are no look-alikes, from which they confirm each
+            other. Source: ``python -m engram_lab.checks.equal_fronts``.
     """
 
     attempts: int = 8
@@ -69,6 +73,7 @@ class LoopConfig:
     confirm_after_most_m: float = 20.0
     confirm_within_m: float = 22.0
     certain_m: float = 1.0
+    proof: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("attempts", "answer_after_frames"):
@@ -76,7 +81,7 @@ class LoopConfig:
                 raise ConfigError(f"loops: {name} is {getattr(self, name)}, must be >= 1")
         for name in (
             "near_m", "own_exclusion_m", "confirm_after_m", "confirm_after_most_m",
-            "confirm_within_m", "certain_m",
+            "confirm_within_m", "certain_m", "proof",
         ):  # fmt: skip
             if not 0 <= getattr(self, name) < np.inf:
                 raise ConfigError(f"loops: {name} is {getattr(self, name)}, must be >= 0")
@@ -101,11 +106,21 @@ class _Question:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Match:
-    """An edge that would close a loop, the number of its inliers, and their depth."""
+    """A match that would close a loop.
+
+    Attributes:
+        edge: that it would add.
+        match: the match.
+        frame: of the new node.
+        depth_m: of the inliers.
+        alike: log-odds that it is a look-alike, beyond those that prove it none.
+    """
 
     edge: Edge
-    inliers: int
+    match: Match
+    frame: Frame
     depth_m: float
+    alike: float = 0.0
 
 
 class LoopSearch:
@@ -117,6 +132,7 @@ class LoopSearch:
         attempter: makes attempts, as of a lost robot: there is no prediction.
         acceptance: thresholds by which two matches agree.
         config: settings.
+        yardstick: what matches in this map usually have; None: look-alikes are not told.
     """
 
     def __init__(
@@ -126,12 +142,14 @@ class LoopSearch:
         attempter: Attempter,
         acceptance: AcceptanceConfig,
         config: LoopConfig | None = None,
+        yardstick: Yardstick | None = None,
     ) -> None:
         self.config = config or LoopConfig()
         self._graph = graph
         self._book = book
         self._attempter = attempter
         self._acceptance = acceptance
+        self._yardstick = yardstick
         self._frames = 0
         self._asked: deque[tuple[int, Future[_Match | None]]] = deque()
         self._waiting: list[_Match] = []
@@ -172,8 +190,19 @@ class LoopSearch:
         while self._asked and self._asked[0][0] <= frame:
             match = self._asked.popleft()[1].result()
             if match is not None:
-                edges += [one.edge for one in self._confirmed(match)]
+                edges += [one.edge for one in self._confirmed(self._weighed(match))]
         return edges
+
+    def _weighed(self, found: _Match) -> _Match:
+        """The match with the log-odds that it is a look-alike."""
+        index = self._graph.index(found.edge.a)
+        usual = None if self._yardstick is None else self._yardstick.usual(index)
+        known = self._attempter.frame(found.edge.a)
+        if usual is None or known is None or not is_measured(known.descriptor):
+            return found
+        likeness = Likeness.of(found.match, known, found.frame, usual, 0)
+        judged = likeness.judged()
+        return replace(found, alike=judged * (likeness.alike() + self.config.proof))
 
     def _confirmed(self, match: _Match) -> list[_Match]:
         """The match and the waiting ones that agree with it; none if it must wait itself."""
@@ -186,6 +215,7 @@ class LoopSearch:
             one
             for one in self._waiting
             if passed_m[one] >= self._base_line_m(one)
+            and one.alike + match.alike <= 0
             and edges_agree(
                 self._graph, one.edge, match.edge, self._acceptance, self.config.certain_m
             )
@@ -237,7 +267,7 @@ class LoopSearch:
         places = [place for place in likeliest if place not in excluded]
         matches = [self._matched(question, place) for place in spread(places, self.config.attempts)]
         believed = [found for found in matches if found is not None]
-        return max(believed, key=lambda found: found.inliers, default=None)
+        return max(believed, key=lambda found: found.match.inliers, default=None)
 
     def _matched(self, question: _Question, place: int) -> _Match | None:
         """The match with a place, if it is accepted."""
@@ -254,7 +284,7 @@ class LoopSearch:
         edge = Edge(
             known, question.node, EdgeKind.MATCH, match.reference_from_live, match.covariance
         )
-        return _Match(edge, match.inliers, evidence.spread.depth_m)
+        return _Match(edge, match, question.frame, evidence.spread.depth_m)
 
 
 def edges_agree(

@@ -8,9 +8,10 @@ from typing import Any
 
 from engram import __version__
 from engram.config import to_dict
-from engram.localiser import ByAppearance, FrameMatcher, Localiser
+from engram.localiser import ByAppearance, FrameMatcher, Localiser, Rule
 from engram.localiser.attempts import Attempter
 from engram.localiser.relocalisation import Suggested
+from engram.localiser.yardstick import Yardstick
 from engram.mapper import LoopConfig, LoopSearch, Mapper, NodeSaver, Saver
 from engram.maps import Map, Revision, RevisionWriter, StoredSession
 from engram.places import RECOGNISERS
@@ -148,10 +149,13 @@ def loop_search(
     if not isinstance(finder, ByAppearance):
         return nullcontext()
     matching = settings.localiser
+    attempter = Attempter(opened.frames, matching, FrameMatcher(opened.frames, matching.matcher))
+    told = matching.lookalikes.doubt > 0 and matching.acceptance.rule is Rule.CONFIDENCE
     return LoopSearch(
         localiser.graph,
         finder.book,
-        Attempter(opened.frames, matching, FrameMatcher(opened.frames, matching.matcher)),
+        attempter,
         matching.acceptance,
         LoopConfig(near_m=matching.search_radius_m, own_exclusion_m=matching.own_exclusion_m),
+        Yardstick(localiser.graph, attempter.frame, matching.matcher) if told else None,
     )

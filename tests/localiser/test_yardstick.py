@@ -1,0 +1,121 @@
+"""Runs of look-alikes are told by what matches on the mapped road usually have."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.mapping_rig import map_simulated
+from tests.synthetic_world import World, drive
+
+from engram.localiser.yardstick import Likeness, LookalikeConfig, Run
+from engram.maps import Map
+from engram.robot import Front, Robot, Settings
+from engram.robot.localisers import localiser_in
+
+STREET = World(90.0)
+
+
+class Copied(World):
+    """A street that shares some of the points of another one, and looks of them to the bit."""
+
+    def __init__(self, of: World, share: float) -> None:
+        super().__init__(of.length_m, seed=of.seed)
+        other = World(of.length_m, seed=of.seed + 100)
+        self._same = np.random.default_rng(3).random(len(self.points)) < share
+        self._other = other
+        self.points = np.where(self._same[:, None], self.points, other.points)
+
+    def descriptors(self, appearance: int) -> np.ndarray:
+        own, other = super().descriptors(appearance), self._other.descriptors(appearance)
+        return np.where(self._same[:, None], own, other)
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("maps") / "street.engram"
+    map_simulated(path, drive(STREET, np.arange(0.0, 88.0, 0.7)))
+    return path
+
+
+def fixes(path: Path, world: World, **lookalikes: float) -> np.ndarray:
+    """Which frames along a street are localised."""
+    settings = Settings()
+    config = replace(settings.localiser, lookalikes=LookalikeConfig(**lookalikes))
+    settings = replace(settings, localiser=config)
+    seen = drive(world, np.arange(5.0, 80.0, 0.7), seed=1)
+    with (
+        Map.open(path) as opened,
+        localiser_in(opened, seen[0].frame.camera, settings) as localiser,
+    ):
+        robot = Robot(Front(settings), localiser)
+        return np.array([robot.step(one.logged).localised for one in seen])
+
+
+def test_a_street_that_shares_a_quarter_of_what_is_seen_is_not_the_mapped_one(
+    mapped: Path,
+) -> None:
+    copy = Copied(STREET, 0.25)
+    assert fixes(mapped, copy, doubt=0.0).mean() > 0.5  # they agree with each other
+    assert fixes(mapped, copy).mean() < 0.05
+
+
+def test_the_street_itself_is_localised_from_the_first_frame_on(mapped: Path) -> None:
+    assert fixes(mapped, STREET).mean() > 0.97
+    assert fixes(mapped, Copied(STREET, 0.8)).mean() > 0.97  # some of it has changed
+
+
+LOOKALIKE = Likeness(share=float(np.log(0.25)), more_bits=3.0, contradicted=0.2)
+USUAL = Likeness(share=float(np.log(0.7)), more_bits=3.0, contradicted=0.08)
+
+
+def after(*found: Likeness, step_m: float = 2.0) -> Run:
+    run = Run(LookalikeConfig())
+    for number, one in enumerate(found):
+        assert run.due(number * step_m)
+        run.add(one, number * step_m)
+    return run
+
+
+def test_one_lookalike_is_doubted_and_a_run_of_usual_matches_is_believed_again() -> None:
+    assert not after(LOOKALIKE).believed
+    assert not after(*[LOOKALIKE] * 20).believed
+    assert after(USUAL).proved
+    assert after(*[LOOKALIKE] * 3, *[USUAL] * 20).proved
+    assert not after(*[USUAL] * 3, *[LOOKALIKE] * 40).believed
+
+
+def test_few_inliers_that_differ_in_many_bits_or_that_odometry_lacks_too_are_no_lookalikes() -> (
+    None
+):
+    night = replace(LOOKALIKE, more_bits=34.0, contradicted=0.06)
+    rain = replace(LOOKALIKE, tracked=0.5)
+    assert after(*[night] * 20).proved
+    assert after(*[rain] * 20).proved
+
+
+def test_a_believed_run_is_looked_at_again_after_some_metres_only() -> None:
+    run = after(USUAL)
+    assert not run.due(1.0)
+    assert run.due(2.0)
+    assert after(LOOKALIKE).due(0.1)
+
+
+def test_a_robot_that_meets_a_node_where_it_was_saved_expects_no_more_than_usual_elsewhere(
+    tmp_path: Path,
+) -> None:
+    """A frame shares all its landmarks with the node that it was saved as."""
+    seen = drive(STREET, np.arange(0.0, 40.0, 1.2))
+    path = tmp_path / "street.engram"
+    map_simulated(path, seen)
+    settings = Settings()
+    with (
+        Map.open(path) as opened,
+        localiser_in(opened, seen[0].frame.camera, settings) as localiser,
+    ):
+        robot = Robot(Front(settings), localiser)
+        inliers = [robot.step(one.logged).inliers for one in seen]
+        usual = robot.outcomes[0].candidate.standing.usual_inliers
+    assert 0 < usual < 0.9 * np.median(inliers)
