@@ -53,8 +53,8 @@ class Fronts:
     Attributes:
         period_m: way after which they do, metres.
         equal: share of the houses that are copies; the others are each unique.
-        unique: what else is unique: tarmac and pavement, with its width; trees, signs and benches; parked cars.
-            The rest is the same around each block.
+        unique: what else is unique: tarmac and pavement, with its width; trees, signs and benches;
+            parked cars. The rest is the same around each block.
 
     Raises:
         ConfigError: the period is outside 10 to 75 m, or the share outside 0 to 1.
