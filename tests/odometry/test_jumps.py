@@ -7,8 +7,8 @@ import pytest
 
 from engram.geometry import SE3
 from engram.odometry import GapFiller, OdometryStatus, OdometryStep
+from engram.odometry.guess import Guess
 from engram.odometry.jumps import Jumps
-from engram.odometry.outside import Guess
 
 STEP = OdometryStep(
     OdometryStatus.OK, SE3(np.eye(3), np.array([0.0, 0.0, 0.7])), np.eye(6) * 1e-4, 200

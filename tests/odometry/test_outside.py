@@ -65,20 +65,30 @@ class TestLearning:
     def test_slipping_wheels_change_no_scale_and_lose_trust(self) -> None:
         model = driven(OutsideModel(), 10)
         before = model.scale
-        for _ in range(5):
-            model.add(wheels(3 * STEP_M))
+        for number in range(1, 6):  # slips more and more
+            model.add(wheels((1 + 0.15 * number) * STEP_M))
             model.compare(seen())
-        assert model.scale == before
-        assert model.slip == pytest.approx(5 / 15)
-        model.add(wheels())
+        assert model.scale == pytest.approx(before, rel=0.01)
+        assert 0 < model.slip < 0.5
+        model.add(wheels(1.6 * STEP_M))
         guess = model.guess()
         assert guess is not None
-        assert guess.sigma_m > 0.3  # as much as wheels slip here
+        assert guess.sigma_m > 0.2  # as much as wheels slip here
         for _ in range(20):
-            model.add(wheels(3 * STEP_M))
             model.compare(seen())
-        model.add(wheels())
+            model.add(wheels(1.7 * STEP_M))
         assert model.guess() is None
+
+    @pytest.mark.parametrize("metres", [0.0, 3.0])
+    def test_wheels_that_stick_or_spin_at_once_must_agree_anew(self, metres: float) -> None:
+        model = driven(OutsideModel())
+        model.add(wheels(metres))
+        assert model.guess() is None  # from 10 m/s within 0.1 s
+        assert model.moves is None
+        model.compare(seen())
+        driven(model, 5)
+        model.add(wheels())
+        assert model.guess() is not None
 
     def test_wheels_of_a_reversed_sign_are_left_aside(self) -> None:
         model = driven(OutsideModel(), 3, scale=-1.0)
@@ -125,11 +135,11 @@ class TestLearning:
             model.add(OutsideMotion(SE3.identity(), STEP_S, True, bias))
             model.compare(seen(0.0))
         for _ in range(50):  # straight on, as the biased gyroscope sees it
-            twist = np.array([0.0, 0.0, STEP_M, *(bias * STEP_S)])
+            twist = np.array([0.0, 0.0, 0.1, *(bias * STEP_S)])
             model.add(OutsideMotion(SE3.exp(twist), STEP_S, True, bias))
         guess = model.guess()
         assert guess is not None
-        np.testing.assert_allclose(guess.prev_from_curr.translation, [0, 0, 50], atol=0.01)
+        np.testing.assert_allclose(guess.prev_from_curr.translation, [0, 0, 5], atol=0.01)
         assert guess.prev_from_curr.angle_rad < 1e-4
 
 

@@ -28,7 +28,7 @@ from engram.config import check_bounds
 from engram.frontend import Frame, FrameStatus, Landmarks, MatcherConfig
 from engram.frontend.matching import features, match_frames
 from engram.geometry import SE3, StereoCamera
-from engram.odometry.outside import Guess
+from engram.odometry.guess import Guess
 
 _NOTHING = np.zeros(0, np.bool_)
 # Most frames over which landmarks are compared.

@@ -1,9 +1,12 @@
-"""Motion over frames at which odometry fails, or is less certain than a guess.
+"""Motion by the visual steps of the last seconds, and by wheels and gyroscope where there are any.
 
 A drop on the lens, a flash or a bus that fills the view stops odometry for a frame or two. The
 robot hardly changes its speed in that time, and discarding its position would break up every map
 made in a shower. So its motion is extrapolated, with a covariance that allows for braking and
 turning. Over longer gaps that covariance grows until the robot counts as lost.
+
+A step that was measured may be wrong, too. It is weighed against the steps before and after it, by
+how many landmarks agree on each, and against wheels and gyroscope, by their covariances.
 """
 
 from __future__ import annotations
@@ -21,14 +24,17 @@ from numpy.typing import NDArray
 from engram import _core
 from engram.config import check_bounds
 from engram.geometry import SE3
+from engram.odometry.evidence import Speed, Speeds
+from engram.odometry.guess import Guess
 from engram.odometry.jumps import Jumps
-from engram.odometry.outside import Guess
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.odometry.vague import VagueRun
 
 _NS_PER_S = 1e9
 # Variance of an unknown turn rate, (rad/s)².
 _ANY_TURN = 1e4
+# Standard deviations apart from which wheels and odometry do not measure the same.
+_GATE = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +124,50 @@ class GapConfig:
     steady_s: Annotated[
         float, Meta(ge=0, description="s within which no robot sets off unnoticed")
     ] = 0.5
+    window_s: Annotated[
+        float, Meta(gt=0, description="s for which a measured step is evidence of the speed")
+    ] = 2.0
+    weak_share: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=1,
+            description="a step with less than this share of the usual inliers is weak: it is "
+            "judged by strong ones and judges none of them",
+        ),
+    ] = 0.6
+    weak_m_s2: Annotated[
+        float,
+        Meta(
+            gt=0,
+            description="m/s² since the last strong step; a weak one beyond it counts as missing: "
+            "a car brakes with 3 in traffic",
+        ),
+    ] = 4.0
+    refuted_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="m that weak steps which a strong one refutes may have been wrong in all, "
+            "before the position no longer follows from them",
+        ),
+    ] = 1.0
+    sure_start: Annotated[
+        float,
+        Meta(
+            ge=0,
+            le=1,
+            description="share of a frame's landmarks that agree on a sure step. A drive that "
+            "begins with fewer is guessed to move so, until a sure step or for `unsure_s`",
+        ),
+    ] = 0.15
+    unsure_s: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="s after which weak steps that go on are believed: a dark or wet road",
+        ),
+    ] = 3.0
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -133,7 +183,8 @@ class Motion:
             drive and at an unusable one.
         covariance: (6, 6) float64 of `prev_from_curr`, left perturbation, [translation in
             m, rotation in rad]; None if that is.
-        guessed_m: standard deviation of a guess, metres; 0 if odometry measured the motion.
+        guessed_m: standard deviation of a guess, metres, also where a weak measurement is doubtful;
+            0 if odometry measured the motion.
         ahead: at an unusable frame, the guess of the motion since the last usable one, with its
             (6, 6) float64 covariance; it is not part of the motion that the next usable frame
             brings.
@@ -191,14 +242,19 @@ _ANY_MOTION = Guess(SE3.identity(), np.eye(6) * np.pi**2, np.inf)
 
 
 class GapFiller:
-    """Takes the steps of odometry in order, and guesses the missing ones.
+    """Takes the steps of odometry in order, weighs them, and guesses the missing ones.
 
     - A measurement less certain than the guess counts as missing, but only for a few steps, as the
       robot may change its speed.
     - A measurement that needs an impossible acceleration counts as missing. At night in rain, the
       robot's own headlamps on the road make it seem to stop at once, with a small covariance. The
-      longer ago the speed was measured, the larger the change allowed.
-    - The covariance of measured steps grows with the share of missing steps among the newest.
+      longer ago the speed was measured, the larger the change allowed. Only steps as strong as it
+      may tell (`Speeds`).
+    - The first weak measurements of a drive, and those that go on where they had contradicted
+      strong ones, are guesses that may be wrong by their whole length, until strong ones come.
+    - Where wheels and gyroscope agree with a measurement that is vaguer, both are weighed.
+    - The covariance of measured steps grows with the share of missing steps among the newest, and
+      by the way that earlier ones, refuted by it, were wrong.
     - Errors of guesses and vague steps in a row have one cause, and add up: at night in rain all
       are too short. Among them the robot may be as fast as when odometry was last sharp.
     - A robot that starts its drive moving, without a measured step, has no known speed. Its first
@@ -210,10 +266,14 @@ class GapFiller:
 
     def __init__(self, config: GapConfig = GapConfig()) -> None:
         self.config = self._config = config
-        # x, y, z in m/s each, in the camera that they begin in; the newest last.
-        self._velocities: deque[list[float]] = deque(maxlen=self._config.speed_steps)
-        # Their median.
-        self._velocity: NDArray[np.float64] = np.zeros(3)
+        self._speeds = Speeds(
+            config.window_s,
+            config.weak_share,
+            config.speed_steps,
+            config.steps_to_know_speed,
+            config.greatest_acceleration_m_s2,
+            config.weak_m_s2,
+        )
         # Consecutive measurements too uncertain to determine the speed.
         self._unlearnt = 0
         self._turn_per_s = np.zeros(3)
@@ -233,6 +293,11 @@ class GapFiller:
         self._guessed_m_per_s: deque[float] = deque(maxlen=self._config.newest_steps)
         # Time for which the robot has moved at a speed not yet known.
         self._unknown_s = 0.0
+        # Whether steps are unsure: at the start, and since weak ones contradicted strong ones.
+        self._unsure = True
+        # When the first such step was believed, and the inliers of a sure one; None at the start.
+        self._unsure_from_ns: int | None = None
+        self._sure_from: float | None = None
 
     def motion(
         self,
@@ -241,15 +306,17 @@ class GapFiller:
         outside: Guess | None = None,
         *,
         doubted: bool = False,
+        landmarks: int = 0,
     ) -> Motion:
         """The motion since the previous usable frame.
 
         Args:
             odometry: the step that ends in this frame.
             stamp_ns: stamp of the frame.
-            outside: the same motion by wheels and gyroscope, which replaces a guess by the last
-                speed; None if unknown.
-            doubted: whether odometry is doubtful and contradicts it, and counts as missing.
+            outside: the same motion by wheels and gyroscope; None if unknown.
+            doubted: whether it disproves odometry, which then counts as missing.
+            landmarks: of the frame; 0 if unknown. Where that is, or the step comes from a map and
+                has no inliers, it is taken to be as strong as any.
         """
         if odometry.status is OdometryStatus.UNUSABLE_FRAME:
             return Motion(odometry, ahead=self._ahead(stamp_ns, outside))
@@ -257,12 +324,12 @@ class GapFiller:
         if odometry.status is OdometryStatus.FIRST:
             return Motion(odometry)
         seconds = 0.0 if before is None else (stamp_ns - before) / _NS_PER_S
-        moved = self._moved(odometry, stamp_ns, seconds, outside, doubted=doubted)
+        moved = self._moved(odometry, stamp_ns, seconds, outside, landmarks, doubted=doubted)
         # Wheels or a gyroscope know of a motion that the images do not show.
         jumped, suspected = self._jumps.jumped(odometry.inliers, seconds), self._jumps.suspected
         if outside is not None or not (jumped or suspected):
             return moved
-        return replace(moved, jumped=jumped, suspected=suspected)
+        return replace(moved, jumped=jumped or moved.jumped, suspected=suspected)
 
     def _moved(
         self,
@@ -270,31 +337,54 @@ class GapFiller:
         stamp_ns: int,
         seconds: float,
         outside: Guess | None,
+        landmarks: int,
         *,
         doubted: bool,
     ) -> Motion:
         """The motion within so many seconds: measured, or a guess."""
         measured, covariance = odometry.prev_from_curr, odometry.covariance
+        if not doubted and outside is not None and outside.contradicts(measured, covariance, _GATE):
+            outside = None  # the images are surer
         guess = self._guess(seconds, stamp_ns, outside)
-        if seconds > 0 and self._knows_speed:
+        if seconds > 0 and self._speeds.known:
             self._guessed_m_per_s.append(guess.prev_from_curr.distance_m / seconds)
-        if (
-            measured is None
-            or covariance is None
-            or doubted
-            or self._too_vague(sigma_m := _core.greatest_sigma(covariance), guess)
-            or self._impossible(twist := measured.log(), sigma_m, seconds)
-        ):
-            self._missing.append(True)
-            if guess is not outside:
-                self._run.go_on(self._wrong_m(guess.prev_from_curr, seconds))
-            if guess is _ANY_MOTION:
-                self._unknown_s += max(seconds, 0.0)
-            return Motion(odometry, guess.prev_from_curr, guess.covariance, guess.sigma_m)
+        if measured is None or covariance is None or doubted:
+            return self._missed(odometry, guess, outside, seconds)
+        if outside is not None and outside.is_sharper(covariance):
+            measured, covariance = outside.weighed_with(measured, covariance)
+        sigma_m = _core.greatest_sigma(covariance)
+        twist = measured.log()
+        per_s = twist / seconds if seconds > 0 else twist
+        speed = Speed(stamp_ns, seconds, per_s[:3].tolist(), sigma_m, odometry.inliers)
+        self._speeds.see(stamp_ns, odometry.inliers)
+        confirmed = outside is not None and outside.has_way
+        if not confirmed and not self._plausible(speed, guess, measured.distance_m):
+            return self._missed(odometry, guess, outside, seconds)
+        refuted_m = self._speeds.believe(speed)
+        unsure_m = self._unsure_m(odometry.inliers, landmarks, measured, seconds)
+        if confirmed:
+            refuted_m = unsure_m = 0.0
         self._missing.append(False)
         self._believed_ns = stamp_ns
         if seconds > 0:
-            self._learn(measured.distance_m, twist / seconds, covariance, sigma_m, seconds)
+            speed = replace(speed, doubted=True) if unsure_m else speed
+            self._learn(speed, measured.distance_m, per_s[3:], covariance)
+        wrong_m = math.hypot(unsure_m, refuted_m)
+        measured, covariance = self._as_sure(measured, covariance, sigma_m, wrong_m, seconds)
+        jumped = refuted_m > self._config.refuted_m
+        return Motion(odometry, measured, covariance, unsure_m, jumped=jumped)
+
+    def _as_sure(
+        self,
+        measured: SE3,
+        covariance: NDArray[np.float64],
+        sigma_m: float,
+        wrong_m: float,
+        seconds: float,
+    ) -> tuple[SE3, NDArray[np.float64]]:
+        """A step that is believed, with all that it may be wrong by, and what it makes up for."""
+        if wrong_m:
+            covariance, sigma_m = covariance + self._wrong_by(wrong_m), math.hypot(sigma_m, wrong_m)
         if sigma_m <= self._vague_from_m(measured, seconds):
             self._run.break_off()
         else:
@@ -302,25 +392,63 @@ class GapFiller:
         if any(self._missing):
             covariance = covariance + self._doubt(measured, seconds)
         if self._unknown_s and seconds > 0:
-            measured, covariance = self._made_up_for(measured, covariance, seconds)
-        return Motion(odometry, measured, covariance)
+            return self._made_up_for(measured, covariance, seconds)
+        return measured, covariance
+
+    def _plausible(self, speed: Speed, guess: Guess, step_m: float) -> bool:
+        """Whether a measured step is better than the guess, and possible."""
+        if self._too_vague(speed.sigma_m, guess) and not (
+            self._is_sharp(speed, step_m) and self._speeds.stronger_than_all(speed.inliers)
+        ):
+            return False
+        possible, strong_from = self._speeds.possible(speed), self._speeds.strong_from
+        if not possible and speed.inliers < strong_from:
+            before = self._sure_from if self._unsure else None
+            self._sure_from = max(before or 0.0, strong_from)
+            self._unsure, self._unsure_from_ns = True, None
+        return possible
+
+    def _missed(
+        self, odometry: OdometryStep, guess: Guess, outside: Guess | None, seconds: float
+    ) -> Motion:
+        """A step that was not measured, or is not believed."""
+        self._missing.append(True)
+        if guess is not outside:
+            self._run.go_on(self._wrong_m(guess.prev_from_curr, seconds))
+        if guess is _ANY_MOTION:
+            self._unknown_s += max(seconds, 0.0)
+        return Motion(odometry, guess.prev_from_curr, guess.covariance, guess.sigma_m)
+
+    def _unsure_m(self, inliers: int, landmarks: int, measured: SE3, seconds: float) -> float:
+        """How wrong an unsure step may be: all of it, until enough landmarks agree on one."""
+        if not self._unsure:
+            return 0.0
+        assert self._stamp_ns is not None
+        if self._unsure_from_ns is None:
+            self._unsure_from_ns = self._stamp_ns
+        sure_from = self._sure_from
+        if sure_from is None:
+            sure_from = self._config.sure_start * landmarks
+        unsure_s = (self._stamp_ns - self._unsure_from_ns) / _NS_PER_S
+        self._unsure = 0 < inliers < sure_from and unsure_s < self._config.unsure_s
+        if not self._unsure:
+            return 0.0
+        return max(self._step_m(measured, seconds), self._config.least_sigma_m)
 
     def _learn(
         self,
+        speed: Speed,
         step_m: float,
-        twist_per_s: NDArray[np.float64],
+        turn_per_s: NDArray[np.float64],
         covariance: NDArray[np.float64],
-        sigma_m: float,
-        seconds: float,
     ) -> None:
         """Updates speed and turn rate for later guesses, weighted by certainty."""
-        sharp = sigma_m <= max(self._config.sharp_share * step_m, 0.5 * self._config.least_sigma_m)
+        seconds, speeds, sharp = speed.seconds, self._speeds, self._is_sharp(speed, step_m)
         self._unlearnt = 0 if sharp else self._unlearnt + 1
         # An uncertain speed is better than none, or an old one.
-        if sharp or not self._knows_speed or self._unlearnt > self._config.speed_steps:
-            self._velocities.append(twist_per_s[:3].tolist())
-            self._velocity = _median(self._velocities)
-            speed_m_per_s = math.sqrt(self._velocity @ self._velocity)
+        if sharp or not speeds.known or self._unlearnt > self._config.speed_steps:
+            speeds.learn(speed)
+            speed_m_per_s = math.sqrt(speeds.m_per_s @ speeds.m_per_s)
             since_m_per_s = 0.0 if sharp else self._fast_m_per_s
             self._fast_m_per_s = max(speed_m_per_s, since_m_per_s)
         # A Kalman filter; the turn rate changes per step by the error of a guess. The change does
@@ -329,7 +457,7 @@ class GapFiller:
         expected = self._turn_variance + (change_rad / seconds) ** 2
         measured_to = float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]) / seconds**2
         gain = expected / (expected + measured_to)
-        self._turn_per_s = self._turn_per_s + gain * (twist_per_s[3:] - self._turn_per_s)
+        self._turn_per_s = self._turn_per_s + gain * (turn_per_s - self._turn_per_s)
         self._turn_variance = (1.0 - gain) * expected
 
     def _made_up_for(
@@ -352,10 +480,17 @@ class GapFiller:
 
         For a robot that seems to have stopped it follows from its previous speed.
         """
-        step_m = self._step_m(measured, seconds)
         share = sum(self._missing) / self._config.newest_steps
-        variances = np.repeat([step_m**2, (self._config.sigma_rad_per_m * step_m) ** 2], 3)
-        return np.diag(share * variances)
+        return share * self._wrong_by(self._step_m(measured, seconds))
+
+    def _wrong_by(self, wrong_m: float) -> NDArray[np.float64]:
+        """(6, 6) covariance of a step that may be wrong by so much."""
+        return np.diag(np.repeat([wrong_m**2, (self._config.sigma_rad_per_m * wrong_m) ** 2], 3))
+
+    def _is_sharp(self, speed: Speed, step_m: float) -> bool:
+        """Whether a step is certain enough to count for the speed."""
+        config = self._config
+        return speed.sigma_m <= max(config.sharp_share * step_m, 0.5 * config.least_sigma_m)
 
     def _step_m(self, measured: SE3, seconds: float) -> float:
         """Length of a step, metres, or what was expected lately if that is more."""
@@ -376,25 +511,6 @@ class GapFiller:
         self._vague = self._vague + 1 if vague else 0
         return vague and self._vague <= self._config.speed_steps
 
-    @property
-    def _knows_speed(self) -> bool:
-        return len(self._velocities) >= self._config.steps_to_know_speed
-
-    def _impossible(self, twist: NDArray[np.float64], sigma_m: float, seconds: float) -> bool:
-        """Whether a step needs an impossible acceleration since the last accepted motion.
-
-        The reference is the speed of the newest certain step.
-        """
-        if not self._knows_speed or seconds <= 0:
-            return False
-        assert self._stamp_ns is not None
-        assert self._believed_ns is not None
-        since_s = (self._stamp_ns - self._believed_ns) / _NS_PER_S
-        changed = twist[:3] - np.array(self._velocities[-1]) * seconds
-        changed_m = math.sqrt(changed @ changed)
-        possible_m = self._config.greatest_acceleration_m_s2 * since_s * seconds
-        return bool(changed_m > possible_m + 3 * sigma_m)
-
     def _ahead(
         self, stamp_ns: int, outside: Guess | None
     ) -> tuple[SE3, NDArray[np.float64]] | None:
@@ -411,9 +527,9 @@ class GapFiller:
         """
         if outside is not None and outside.has_way:
             return outside
-        if not self._velocities or seconds <= 0:
+        if not self._speeds.any or seconds <= 0:
             return _ANY_MOTION
-        guess = SE3.exp(np.concatenate([self._velocity, self._turn_per_s]) * seconds)
+        guess = SE3.exp(np.concatenate([self._speeds.m_per_s, self._turn_per_s]) * seconds)
         config = self._config
         grown_m = math.sqrt(self._run.variance_m2(self._wrong_m(guess, seconds)))
         least_m = max(config.least_sigma_m, self._started_m(seconds, stamp_ns))
@@ -434,10 +550,3 @@ class GapFiller:
         steady_s, acceleration_m_s2 = self._config.steady_s, self._config.acceleration_m_s2
         until_s, since_s = (max(one - steady_s, 0.0) for one in (gap_s, gap_s - seconds))
         return 0.5 * acceleration_m_s2 * float(np.sqrt(max(until_s**4 - since_s**4, 0.0)))
-
-
-def _median(rows: Sequence[Sequence[float]]) -> NDArray[np.float64]:
-    """The median of each column, as `np.median` has it."""
-    low, high = (len(rows) - 1) // 2, len(rows) // 2
-    columns = (sorted(column) for column in zip(*rows, strict=True))
-    return np.array([0.5 * (column[low] + column[high]) for column in columns])

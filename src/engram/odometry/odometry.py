@@ -15,7 +15,7 @@ from engram.errors import IncompatibleError
 from engram.frontend import Frame, FrameStatus, MatcherConfig
 from engram.frontend.matching import check_same_kind, core_settings, features
 from engram.geometry import SE3
-from engram.odometry.outside import Guess
+from engram.odometry.guess import Guess
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.odometry.window import WindowConfig
 

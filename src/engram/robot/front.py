@@ -191,7 +191,7 @@ class Front:
             if astray := self._fixed.note(step.prev_from_curr):
                 # Nobody knows how long it was led astray, nor how fast the robot is.
                 self._gaps = GapFiller(self._settings.gaps)
-            motion = self._moved(step, frame.stamp_ns, doubted=astray or look.doubted)
+            motion = self._moved(step, frame, doubted=astray or look.doubted)
         clock.lap("odometry")
         told = measured.prev_from_curr if measured is not None and measured.has_way else None
         turned_rad = None if measured is None else measured.turned_rad
@@ -225,18 +225,13 @@ class Front:
         """What wheels and gyroscope measured since the last frame, while they can be trusted."""
         return None if self._outside.guess() is None else measured
 
-    def _moved(self, step: OdometryStep, stamp_ns: int, *, doubted: bool) -> Motion:
-        """Odometry's step, or where it fails or is disproved what wheels and gyroscope say."""
-        outside = self._outside
-        guess = outside.guess()
-        doubted = doubted or (
-            guess is not None
-            and step.prev_from_curr is not None
-            and step.covariance is not None
-            and not outside.is_sure(step)
-            and guess.contradicts(step.prev_from_curr, step.covariance, outside.config.gate)
+    def _moved(self, step: OdometryStep, frame: Frame, *, doubted: bool) -> Motion:
+        """Odometry's step weighed against those before it, and against wheels and gyroscope."""
+        outside, landmarks = self._outside, len(frame.landmarks)
+        doubted = doubted or outside.disproves(step, landmarks)
+        motion = self._gaps.motion(
+            step, frame.stamp_ns, outside.guess(), doubted=doubted, landmarks=landmarks
         )
-        motion = self._gaps.motion(step, stamp_ns, guess, doubted=doubted)
         outside.compare(step)
         return motion
 
