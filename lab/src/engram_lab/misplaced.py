@@ -16,7 +16,7 @@ from engram.graph.model import NodeId
 from engram.localiser import Budget, Localisation, Position
 from engram.localiser.attempts import Outcome
 from engram.maps import Map, open_map
-from engram.odometry import OdometryStatus, OdometryStep
+from engram.odometry import OdometryStatus, OdometryStep, OutsideMotion
 from engram.robot import Robot, Settings
 from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
@@ -150,8 +150,21 @@ class Street:
         error = self.error(frame, node, node_from_live)
         return None if error is None else error[0] > FALSE_M or error[1] > FALSE_RAD
 
-    def run(self, one: Try, *, relocalises: bool = True) -> Iterator[Looked]:
-        """Drives the robot, frame by frame; `relocalises` if it looks for itself elsewhere."""
+    def run(
+        self,
+        one: Try,
+        *,
+        relocalises: bool = True,
+        outside: Sequence[OutsideMotion | None] | None = None,
+    ) -> Iterator[Looked]:
+        """Drives the robot, frame by frame.
+
+        Args:
+            one: what happens to it.
+            relocalises: whether it looks for itself elsewhere.
+            outside: what its wheels and gyroscope measure before each frame of the drive, of a
+                robot that is shown all frames; None without them.
+        """
         localiser = localiser_in(
             self.opened,
             self.live.camera,
@@ -167,7 +180,8 @@ class Street:
             if start is not None:
                 robot.place_at(start)
             for number, frame in enumerate(shown):
-                found = robot.step(self._logged(one, shown, number))
+                motion = None if outside is None else outside[frame]
+                found = robot.step(self._logged(one, shown, number), motion=motion)
                 counts = one.kind in _TO_THE_END or number >= len(shown) - FRAMES
                 yield Looked(found, robot.outcomes, frame, counts)
 

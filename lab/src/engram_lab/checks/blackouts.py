@@ -28,10 +28,9 @@ from engram.robot import RobotOptions, Settings, map_drive, open_map, robot_on
 from engram.sequences import FrameLog, LoggedFrame, open_sequence
 from engram.sequences.trajectories import Trajectory
 from engram_lab.truth import read_truth
+from engram_lab.wheels import BIAS_RAD_S, measured
 
 BLACK_M = 50.0
-SCALE, SCATTER = 1.02, 0.01
-BIAS_RAD_S, NOISE_RAD_S = np.array([0.01, -0.01, 0.01]), 0.002
 _REST = 20
 _SETTLED_M, _APART_M = 20.0, 15.0
 # A pose this far from the truth is wrong, m.
@@ -63,20 +62,6 @@ def blackout(frames: list[LoggedFrame], first: int, last: int) -> Iterator[Logge
             yield LoggedFrame(one.frame, OdometryStep(OdometryStatus.NO_CONSENSUS))
         else:
             yield one
-
-
-def measured(truth: list[SE3], stamps_ns: list[int], seed: int) -> list[OutsideMotion | None]:
-    """What wheels and gyroscope measure between the frames."""
-    rng = np.random.default_rng(seed)
-    found: list[OutsideMotion | None] = [None]
-    for at in range(1, len(truth)):
-        seconds = (stamps_ns[at] - stamps_ns[at - 1]) / 1e9
-        true = truth[at - 1].inverse() @ truth[at]
-        rates = true.log()[3:] / seconds + BIAS_RAD_S + rng.normal(0, NOISE_RAD_S, 3)
-        way = true.translation * (SCALE + rng.normal(0, SCATTER))
-        turn = SE3.exp(np.r_[np.zeros(3), rates * seconds]).rotation
-        found.append(OutsideMotion(SE3(turn, way), seconds, True, rates))
-    return found
 
 
 def at_rest(first: LoggedFrame) -> Iterator[tuple[LoggedFrame, OutsideMotion | None]]:
