@@ -58,9 +58,19 @@ def info(
         typer.echo(json.dumps(plain(facts)) if as_json else _bag_text(facts))
         if facts.lost or facts.question:
             raise typer.Exit(3 if facts.lost else 2)
+        _judge(facts.faulty_share)
         return
     found = _drive_facts(path, opening)
     typer.echo(json.dumps(found) if as_json else _drive_text(found))
+    _judge(found["faulty_share"])
+
+
+def _judge(faulty_share: float) -> None:
+    """Ends with the status of losses if too many frames are left out for a wrong stamp."""
+    from engram.doctor import DoctorConfig
+
+    if faulty_share > DoctorConfig().faulty_share:
+        raise typer.Exit(3)
 
 
 @drive_group.command("calibration", cls=VerbInFull)
@@ -193,6 +203,7 @@ def _bag_text(facts: BagFacts) -> str:
     lines += [f"note: {note}" for note in facts.notes]
     if facts.question:
         lines.append(f"missing: {facts.question}")
+    lines += [f"stamps: {fact}" for fact in facts.stamps]
     lines += [f"lost: {loss}" for loss in facts.lost]
     if facts.command:
         lines.append(f"next: {facts.command}")
@@ -217,6 +228,8 @@ def _drive_facts(path: Path, opening: options.Drive) -> dict[str, Any]:
         "duration_s": seconds,
         **{name: getattr(sequence.camera, name) for name in _CAMERA},
         "notes": list(sequence.cameras.notes) if isinstance(sequence, ImageSequence) else [],
+        "stamps": getattr(sequence, "stamp_facts", []),
+        "faulty_share": sequence.stamps.faulty_share if hasattr(sequence, "stamps") else 0.0,
         "command": shlex.join(["engram", "map", "MAP.engram", str(path), *opening.typed()]),
     }
 
@@ -228,5 +241,6 @@ def _drive_text(facts: dict[str, Any]) -> str:
         f"camera: {facts['width']}×{facts['height']} px, fx {facts['fx']:.1f} px, baseline "
         f"{facts['baseline_m']:.4f} m\n"
         + "".join(f"note: {note}\n" for note in facts["notes"])
+        + "".join(f"stamps: {fact}\n" for fact in facts["stamps"])
         + f"next: {facts['command']}"
     )

@@ -19,12 +19,13 @@ EXIT_DAMAGED = 3
 
 @contextmanager
 def losses_told(sequence: Drive) -> Iterator[None]:
-    """Around what a verb does with a drive: says on stderr what of a bag could not be read.
+    """Around what a verb does with a drive: says on stderr what of it could not be used.
 
     A verb that fails keeps its exit status: a loss may be the reason.
 
     Raises:
-        Exit: parts of the bag were lost; what could be read was used.
+        Exit: parts of a bag were lost, or more frames than the doctor allows were left out for a
+            wrong stamp; what could be read was used.
     """
     _noted(sequence)
     try:
@@ -50,15 +51,17 @@ def _noted(sequence: Drive) -> None:
 
 
 def _told(sequence: Drive, heading: str) -> bool:
-    """Says how a bag's images were paired, and what was lost; whether anything was."""
-    from engram.sequences import BagSequence
+    """Says how images were paired, what was lost and left out; whether it was too much."""
+    from engram.doctor import DoctorConfig
+    from engram.sequences import BagSequence, FrameLog
 
-    if not isinstance(sequence, BagSequence):
-        return False
-    if sequence.pairing.left:
+    if isinstance(sequence, BagSequence) and sequence.pairing.left:
         typer.echo(sequence.pairing.text(), err=True)
-    if sequence.lost:
-        typer.echo(heading, err=True)
-        for loss in sequence.lost:
-            typer.echo(f"  {loss}", err=True)
-    return bool(sequence.lost)
+    lost = sequence.lost if isinstance(sequence, BagSequence) else []
+    for line in [heading, *(f"  {loss}" for loss in lost)] if lost else []:
+        typer.echo(line, err=True)
+    if isinstance(sequence, FrameLog):
+        return False
+    for fact in sequence.stamp_facts:
+        typer.echo(f"warning: {fact}", err=True)
+    return bool(lost) or sequence.stamps.faulty_share > DoctorConfig().faulty_share

@@ -18,6 +18,7 @@ from engram.graph.model import Clock
 from engram.odometry import Motion, OdometryStatus
 from engram.odometry.frozen import equal_share
 from engram.sequences import LoggedFrame
+from engram.sequences.clocks import StampReport
 
 Array = NDArray[np.float64]
 
@@ -85,8 +86,8 @@ class Evidence:
         disparity_px: median of the landmarks.
         sharpness: of every few pairs.
         matches: left-right matches of every few pairs, and the number of their frame.
-        backwards, repeated: frames left out as their stamp is earlier than, or that of, the frame
-            before.
+        read: what became of the stamps in the reader of the drive.
+        taken: what became of them in a robot, which has its frames one by one.
         bad: why other pairs were left out: an image is missing, unreadable or of another size.
         outside: each step as measured by wheels or another source; None where it was not.
         turned_rad: how far each step turned by gyroscope or wheels; None where it was not measured.
@@ -109,8 +110,8 @@ class Evidence:
     disparity_px: list[float] = field(default_factory=list)
     sharpness: list[float] = field(default_factory=list)
     matches: list[tuple[int, SideMatches]] = field(default_factory=list)
-    backwards: int = 0
-    repeated: int = 0
+    read: StampReport = field(default_factory=StampReport)
+    taken: StampReport = field(default_factory=StampReport)
     bad: list[str] = field(default_factory=list)
     outside: list[SE3 | None] = field(default_factory=list)
     turned_rad: list[float | None] = field(default_factory=list)
@@ -205,12 +206,6 @@ class Examination:
         """Matches a live frame again with a frame of the map that it matched best."""
         self.evidence.rematched.add(reference, live, matcher)
         self._unmatched = 0
-
-    def misordered(self, stamp_ns: int, last_ns: int) -> None:
-        """Counts a frame that is left out for its stamp."""
-        if not self.full:
-            self.evidence.backwards += stamp_ns < last_ns
-            self.evidence.repeated += stamp_ns == last_ns
 
     def _repeats(
         self,

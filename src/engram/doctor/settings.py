@@ -33,6 +33,7 @@ class DoctorConfig:
         fixed_share: share of the image that may move with the camera.
         doubted: share of the frames at which part of the image may stand still without a reason.
         gap_ratio: longest interval between frames, in those around it.
+        faulty_share: share of the drive's frames that are left out for a wrong stamp.
         jump_s: interval that is a step of the clock, not a gap, s.
         least_rate_hz: slower cameras give odometry no prediction.
         exposure_step: change of brightness from frame to frame, factors of two.
@@ -67,6 +68,7 @@ class DoctorConfig:
     fixed_share: Annotated[float, Meta(ge=0, lt=1)] = 0.01
     doubted: Annotated[float, Meta(ge=0, lt=1)] = 0.1
     gap_ratio: Annotated[float, Meta(gt=1)] = 2.5
+    faulty_share: Annotated[float, Meta(gt=0, le=1)] = 0.05
     jump_s: Annotated[float, Meta(gt=0)] = 60.0
     least_rate_hz: Annotated[float, Meta(gt=0)] = 4.0
     exposure_step: Annotated[float, Meta(gt=0)] = 0.8

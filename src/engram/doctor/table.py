@@ -58,10 +58,10 @@ _CONSEQUENCES = ("no_odometry", "rows_misaligned", "rows_slightly_off", "scale_o
 
 CHECKS: tuple[Check, ...] = (
     Check(
-        "stamps_backwards", _FATAL, stamps.backwards, 0, "frames",
-        "stamps run backwards",
-        "record again with a clock that only runs forwards, or sort the frames; --skip-bad leaves "
-        "these frames out",
+        "stamps_unreliable", _FATAL, stamps.faulty_share, "faulty_share", "of the frames",
+        "stamps are wrong, and their frames are left out",
+        "look at the driver and the clock that stamp the images; record again",
+        explains=("stamps_backwards",),
     ),
     Check(
         "stamps_counted", _FATAL, stamps.counted, 0.9, "of the frames",
@@ -178,6 +178,17 @@ CHECKS: tuple[Check, ...] = (
         needs="a map: engram localise tells it",
     ),
     Check(
+        "stamps_backwards", _WARNING, stamps.faulty, 0, "frames",
+        "frames are stamped before, or far after, their neighbours",
+        "they are left out; look at the driver that stamps the images",
+    ),
+    Check(
+        "clock_set", _WARNING, stamps.steps, 0, "steps",
+        "the clock was set during the drive",
+        "nothing is lost: times are counted on from there; let the clock be set before a drive "
+        "begins, or slew it",
+    ),
+    Check(
         "stamps_repeated", _WARNING, stamps.repeated, 0, "frames",
         "frames repeat the stamp of the frame before",
         "the driver sends frames twice, or the clock is too coarse; they are left out",
@@ -191,7 +202,7 @@ CHECKS: tuple[Check, ...] = (
     Check(
         "stamp_jump", _WARNING, stamps.jump_s, "jump_s", "s",
         "the stamps jump forwards",
-        "if the clock was set during the drive, split the drive there",
+        "a pause, or a clock that was set; nothing is lost by it",
     ),
     Check(
         "frame_gaps", _WARNING, stamps.gap_ratio, "gap_ratio", "usual intervals",
@@ -296,7 +307,7 @@ def diagnose(seen: Evidence) -> Diagnosis:
     found: list[Finding] = []
     explained: set[str] = set()
     untold: dict[str, str] = {}
-    for check in CHECKS if len(seen) or seen.backwards or seen.bad else ():
+    for check in CHECKS if len(seen) or stamps.faulty(seen) or seen.bad else ():
         result = check.finding(seen)
         if result is None and check.needs:
             untold[check.code] = check.needs

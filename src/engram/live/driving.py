@@ -19,7 +19,7 @@ from engram.localiser import Localisation, LocalisationStatus, Position
 from engram.maps import Map, open_map
 from engram.odometry import Motion, OutsideMotion
 from engram.robot.fixed import ToldFix
-from engram.robot.front import Arrived, Front
+from engram.robot.front import Arrived, Front, at_time, stamp_of
 from engram.robot.live import Owner
 from engram.robot.robot import Robot
 from engram.robot.saved import Saving, SavingState
@@ -27,11 +27,10 @@ from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_in
 from engram.robot.whereabouts import Whereabouts
 from engram.sequences.bags.fixes import Fix
+from engram.sequences.clocks import SteadyClock
 
 # Between attempts to open a map that cannot be opened.
 _AGAIN_AFTER_S = 2.0
-# A stamp that is earlier by less is a frame that came late; by more, a clock that was set back.
-_LATE_FRAME_NS = 1_000_000_000
 # What a robot found is then no longer kept.
 _KEEPS_NO_MORE = {SavingState.FAILED, SavingState.UNCOMMITTED}
 # Added to a position that was kept over a restart: wide enough that it proposes and proves nothing.
@@ -67,6 +66,7 @@ class Step:
         trouble: what went wrong; "" if nothing did.
         map_from_live: pose in the map frame; None where it is not known.
         proposed: whether the position still rests on a hint that no match has confirmed.
+        time_ns: about when it was, ns: its stamp, unless that is wrong or the clock was set back.
     """
 
     motion: Motion | None = None
@@ -74,6 +74,7 @@ class Step:
     trouble: str = ""
     map_from_live: SE3 | None = None
     proposed: bool = False
+    time_ns: int = 0
 
     @property
     def status(self) -> str:
@@ -123,7 +124,6 @@ class Driving:
         self._belief: Position | None = None
         # Whether the robot's position is one that it was only told.
         self._proposed = False
-        self._stamp_ns: int | None = None
         self._outside: Outside | None = None
         self._fix = ToldFix()
         self._open_after = -np.inf
@@ -147,37 +147,51 @@ class Driving:
             outside: what wheels and gyroscope say at its time.
         """
         frame = arrived if isinstance(arrived, StereoPair) else arrived.frame
-        if trouble := self._misplaced(frame.stamp_ns):
-            return Step(trouble=trouble)
         if self._camera is not None and frame.camera != self._camera:
             self.pause()
             self._front = None
         self._camera = frame.camera
         robot = self._robot or self._begun()
-        motion = self._driven(frame.stamp_ns, outside)
-        self._stamp_ns = frame.stamp_ns
+        front = self._front_for(None) if self._front is None else self._front[1]
+        motion = self._driven(front.clock.elapsed_ns(frame.stamp_ns), outside)
         if robot is None:
-            return Step(self._front_for(None).take(arrived, motion)[1], trouble=self.trouble)
+            return self._only_moved(front, arrived, motion)
+        steps = len(front.clock.steps)
         try:
             found = robot.step(arrived, motion=motion, arrived_s=arrived_s)
         except EngramError as error:
             self.pause()
             self.trouble, self._open_after = str(error), self._now() + _AGAIN_AFTER_S
-            taken = (one.motion for one in robot.track[-1:] if one.stamp_ns == frame.stamp_ns)
-            return Step(next(taken, None), trouble=self.trouble)
+            time_ns = front.clock.expected_ns
+            taken = (one.motion for one in robot.track[-1:] if one.stamp_ns == time_ns)
+            return Step(next(taken, None), trouble=self.trouble, time_ns=time_ns)
         self._belief = found.position
         map_from_live = None if self._whereabouts is None else self._whereabouts.after(found)
         if found.status is LocalisationStatus.LOCALISED or found.position is None or found.saved:
             self._proposed = False
         self.trouble = robot.saving.reason if robot.saving.state in _KEEPS_NO_MORE else ""
-        return Step(found.motion, found, self.trouble, map_from_live, self._proposed)
+        clock = front.clock
+        trouble = self.trouble or _stamp_trouble(clock, frame.stamp_ns, steps)
+        place = map_from_live, self._proposed, clock.expected_ns
+        return Step(found.motion, found, trouble, *place)
 
-    def _driven(self, stamp_ns: int, outside: Outside | None) -> OutsideMotion | None:
+    def _only_moved(self, front: Front, arrived: Arrived, motion: OutsideMotion | None) -> Step:
+        """Takes a frame without a map: only its motion is known."""
+        stamp_ns, steps = stamp_of(arrived), len(front.clock.steps)
+        placed = front.clock.take(stamp_ns)
+        if placed:
+            moved = front.take(at_time(arrived, placed[-1].time_ns), motion)[1]
+        else:
+            moved = front.left_out(motion)
+        trouble = _stamp_trouble(front.clock, stamp_ns, steps) or self.trouble
+        return Step(moved, trouble=trouble, time_ns=front.clock.expected_ns)
+
+    def _driven(self, elapsed_ns: int, outside: Outside | None) -> OutsideMotion | None:
         """What wheels and gyroscope measured since the frame before; None if they did not."""
         before, self._outside = self._outside, outside
-        if before is None or outside is None or self._stamp_ns is None:
+        if before is None or outside is None:
             return None
-        return outside.since(before, (stamp_ns - self._stamp_ns) / 1e9)
+        return outside.since(before, elapsed_ns / 1e9)
 
     def map_on(self, on: bool) -> str:
         """Starts or ends mapping; ending commits what was mapped."""
@@ -224,6 +238,11 @@ class Driving:
 
     def fixed(self, fix: Fix) -> str:
         """Takes a satellite fix: near it a lost robot looks, in a map anchored to the earth."""
+        clock = None if self._front is None else self._front[1].clock
+        if clock is not None and clock.time_ns is not None:
+            # The receiver's clock is that of the camera, or one that was not set with it.
+            newest_ns, times = clock.time_ns, (fix.time_ns, fix.time_ns + clock.shift_ns)
+            fix = replace(fix, time_ns=min(times, key=lambda one: abs(one - newest_ns)))
         self._fix.tell(fix)
         return "the fix is accepted"
 
@@ -235,6 +254,8 @@ class Driving:
         """
         robot, self._robot = self._robot, None
         self._proposed = False
+        if self._front is not None and self._front[1].clock.shift_ns:
+            self._front = self._outside = None  # times of the next drive are stamps again
         opened, self._map, self._whereabouts = self._map, None, None
         self._open_after = -np.inf
         if robot is None or opened is None:
@@ -248,17 +269,6 @@ class Driving:
             with suppress(EngramError):  # the drive is what counts, and it is committed or reported
                 opened.close()
         return "" if self._saved.state is SavingState.OFF else self._saved.text()
-
-    def _misplaced(self, stamp_ns: int) -> str:
-        """Why a frame is not taken; after a clock was set back, everything but it begins anew."""
-        if self._stamp_ns is None or stamp_ns > self._stamp_ns:
-            return ""
-        back_ns = self._stamp_ns - stamp_ns
-        if back_ns < _LATE_FRAME_NS:
-            return f"a frame is {back_ns / 1e6:.0f} ms older than the one before it; left out"
-        self.pause()
-        self._front = self._stamp_ns = self._outside = None
-        return f"the camera's clock went back by {back_ns / 1e9:.1f} s; the drive begins anew"
 
     def _begun(self) -> Robot | None:
         """A robot in the map; None while that cannot be opened."""
@@ -309,6 +319,22 @@ class Driving:
         if self._front is None or self._front[0] != kind:
             self._front = kind, Front(settings)
         return self._front[1]
+
+
+def _stamp_trouble(clock: SteadyClock, stamp_ns: int, steps: int) -> str:
+    """What is wrong with the newest stamp; "" if nothing is.
+
+    Args:
+        clock: the clock, which has taken it.
+        stamp_ns: the stamp.
+        steps: how often the clock had been set before.
+    """
+    if len(clock.steps) > steps:
+        return f"{clock.steps[-1].text()}; the drive goes on"
+    if clock.time_ns is None or clock.expected_ns == clock.time_ns:
+        return ""
+    off_ms = (stamp_ns + clock.shift_ns - clock.time_ns) / 1e6
+    return f"a frame is stamped {off_ms:+.0f} ms from the newest good one; left out"
 
 
 def _vague(position: Position) -> Position:

@@ -112,7 +112,7 @@ class LiveProcess:
         step = self._driving.step(event.arrived, event.arrived_s, event.outside)
         arrived = event.arrived
         stamp_ns = (arrived if isinstance(arrived, StereoPair) else arrived.frame).stamp_ns
-        self._track = self._track.after(step, stamp_ns)
+        self._track = self._track.after(step, step.time_ns)
         status = step.status
         before = self._health
         self._health = replace(

@@ -16,7 +16,6 @@ from engram.robot.front import Arrived, Front, arriving, stamp_of
 from engram.robot.session import DriveSequence
 from engram.robot.settings import RobotOptions, Settings
 from engram.sequences import Drive, FrameLog, ImageSequence, LoggedFrame, SequenceInfo
-from engram.sequences.listing import StampFault
 from engram.sequences.motion import MovedSequence
 
 # A long drive is examined in so many stretches, as it may begin at rest or in the dark.
@@ -65,12 +64,9 @@ def examine_drive(
             seen(number, arrived)
             watched.advance("examined")
             watched.check()
-    for fault in sequence.skipped_reasons:
-        if isinstance(fault, StampFault):
-            evidence.backwards += fault.backwards
-            evidence.repeated += not fault.backwards
-        else:
-            evidence.bad.append(fault)
+    evidence.bad += sequence.skipped_reasons
+    if not isinstance(sequence, FrameLog):
+        evidence.read = sequence.stamps
     return front.diagnosis
 
 

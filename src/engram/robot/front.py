@@ -33,6 +33,7 @@ from engram.odometry import (
 from engram.odometry.frozen import Repeats, StandsStill, rests
 from engram.robot.settings import Settings
 from engram.sequences import LoggedFrame
+from engram.sequences.clocks import SteadyClock
 
 T = TypeVar("T")
 Arrived: TypeAlias = StereoPair | LoggedFrame
@@ -56,6 +57,7 @@ class Front:
 
     Attributes:
         examination: what the doctor saw of the first frames.
+        clock: turns the stamps of a robot's frames into times.
     """
 
     def __init__(self, settings: Settings, camera: StereoCamera | None = None) -> None:
@@ -66,6 +68,7 @@ class Front:
         self._fixed = FixedPixels(settings.fixed, settings.odometry.matcher)
         # Motions of frames that were taken ahead.
         self._ahead: deque[Motion] = deque()
+        self.clock = SteadyClock(waits=False)
         self.restart()
 
     def restart(self) -> None:
@@ -170,6 +173,13 @@ class Front:
         if self._ahead and isinstance(arrived, LoggedFrame):
             return arrived.frame, self._ahead.popleft()
         return self._taken(arrived, motion, clock or StageClock())
+
+    def left_out(self, motion: Motion | OutsideMotion | None) -> Motion:
+        """The motion up to a frame that has no time: a guess, as for an unusable one."""
+        if isinstance(motion, OutsideMotion):
+            self._outside.add(motion)
+        nothing = OdometryStep(OdometryStatus.UNUSABLE_FRAME)
+        return self._gaps.motion(nothing, self.clock.expected_ns, self._outside.guess())
 
     def _taken(
         self, arrived: Arrived, motion: Motion | OutsideMotion | None, clock: StageClock
@@ -306,6 +316,15 @@ def paced(items: Iterable[T], rate_hz: float | None) -> Iterator[tuple[float, T]
 def stamp_of(arrived: Arrived) -> int:
     """Stamp of a pair or logged frame, ns."""
     return int(arrived.stamp_ns if isinstance(arrived, StereoPair) else arrived.frame.stamp_ns)
+
+
+def at_time(arrived: Arrived, time_ns: int) -> Arrived:
+    """The same pair or logged frame with its time in place of its stamp."""
+    if stamp_of(arrived) == time_ns:
+        return arrived
+    if isinstance(arrived, StereoPair):
+        return replace(arrived, stamp_ns=time_ns)
+    return replace(arrived, frame=replace(arrived.frame, stamp_ns=time_ns))
 
 
 def arriving(sequence: Iterable[Arrived]) -> Generator[Arrived]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Generator, Iterable
@@ -13,7 +14,7 @@ from typing import Self
 from engram.doctor import Diagnosis
 from engram.errors import ConfigError, InputError, MapError
 from engram.frontend import Frame
-from engram.geometry import SE3
+from engram.geometry import SE3, propagate_covariance
 from engram.graph.graph import ExperienceGraph
 from engram.localiser import (
     KEEPS_NOTHING,
@@ -28,16 +29,25 @@ from engram.localiser.attempts import Outcome
 from engram.localiser.given import InForce
 from engram.monitor import QUIET, Monitor, deferred_interrupt
 from engram.odometry import Motion, OdometryStatus, OdometryStep, OutsideMotion
-from engram.robot.front import Arrived, Front, arriving, check_position, paced, stamp_of
+from engram.robot.front import (
+    Arrived,
+    Front,
+    arriving,
+    at_time,
+    check_position,
+    paced,
+    stamp_of,
+)
 from engram.robot.live import LiveDrive
 from engram.robot.recorder import Recorder
 from engram.robot.saved import Saving
+from engram.sequences import LoggedFrame
+from engram.sequences.clocks import Placed
+from engram.sequences.framelog.reader import compose
 from engram.sequences.motion import MovedSequence
 
 # Frames whose positions `pose_at` remembers: ten seconds at 20 Hz.
 _REMEMBERED = 200
-# So many rising stamps before the newest one are a clock that was set back, not stray frames.
-_SET_BACK = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,12 +95,14 @@ class Robot:
         self._keeper = keeper
         self._live = live
         self._front = front
+        self._clock = front.clock
         self._localiser = localiser
         self._deadline_ms = deadline_ms
         self._saving = Saving() if live is None else live.saving
-        self._stamp_ns: int | None = None
-        # Rising stamps of the newest frames that came too late.
-        self._early_ns: list[int] = []
+        # Time of the newest frame with one.
+        self._time_ns: int | None = None
+        # The motion of the newest frames, if they were left out and a log or the caller knows it.
+        self._behind: OdometryStep | Motion | None = None
         # The newest frames, also those where an error came. Replaced, never changed: another
         # thread may ask `pose_at`.
         self.track: tuple[Localisation, ...] = ()
@@ -153,13 +165,15 @@ class Robot:
         motion: Motion | OutsideMotion | None = None,
         deadline_ms: float | None = None,
         arrived_s: float | None = None,
+        trusted: bool = False,
     ) -> Localisation:
         """Localises one pair or logged frame; call it for each, in temporal order.
 
-        A frame whose stamp is not later than that of the frame before is not used: its result has
-        the status `NO_ODOMETRY`. After three of them with rising stamps the clock counts as set
-        back: a robot that keeps nothing begins anew, as after `lose`; one that keeps its drive does
-        not, as a drive has one clock.
+        A frame with a wrong stamp (see `engram.sequences.clocks`) is not used: its result has the
+        status `NO_ODOMETRY`, and its position is a guess. After two such frames that follow each
+        other the clock counts as set: the robot goes on from the third one, as its images do. Where
+        these do not go on, either, and the clock went back, it was carried elsewhere, as by `lose`.
+        What it saves counts on in time; results and `pose_at` have the stamps of the frames.
 
         Args:
             arrived: a pair of images, (h, w) uint8 grey, rectified, synchronised; or a frame of
@@ -169,6 +183,7 @@ class Robot:
             deadline_ms: latest start of an attempt after the images arrived; None for the
                 robot's own deadline.
             arrived_s: `time.perf_counter` when they arrived; None for now.
+            trusted: whether a reader of drives has looked after the stamp: it is right if it rises.
 
         Returns:
             The localisation. `node_from_live` (metres; x right, y down, z forward) is set only if
@@ -186,10 +201,14 @@ class Robot:
             raise InputError("the robot is closed; make another one with Map.robot")
         self._front.check(arrived, motion, deadline_ms)
         with deferred_interrupt() as raise_if_asked:
-            if not self._in_order(arrived):
+            given, placed = arrived, self._placed(arrived, trusted=trusted)
+            if placed is None:
                 raise_if_asked()
-                return self._left_out(arrived)
+                return self._left_out(arrived, motion)
+            arrived = at_time(arrived, placed.time_ns)
             frame, motion = self._taken(arrived, motion, clock)
+            if _is_elsewhere(placed, motion):
+                self._localiser.lose()
             deadline = None if deadline_ms is None else clock.started + deadline_ms / 1e3
             self._localiser.move(motion)
             try:
@@ -198,7 +217,7 @@ class Robot:
                     found = self._localiser.localise(frame, deadline, self._keeper, clock)
                 for earlier in self.track if found.withdraws else ():
                     if earlier.stamp_ns in found.withdraws:
-                        self.withdraw(earlier)
+                        self._withdraw(earlier)
                 found = self._kept(frame, found)
             except MapError:
                 self._followed(arrived, motion)
@@ -215,9 +234,16 @@ class Robot:
                 self.recorder.note(arrived, frame, found, self._localiser.outcomes)
             self.track = (*self.track[1 - _REMEMBERED :], found)
         raise_if_asked()
-        return found
+        return self._with_stamps(found, stamp_of(given))
 
     localise = step
+
+    def _with_stamps(self, found: Localisation, stamp_ns: int) -> Localisation:
+        """A result with the stamps of its frames in place of times."""
+        if not self._clock.steps:
+            return found
+        withdraws = tuple(map(self._clock.stamp_of, found.withdraws))
+        return replace(found, stamp_ns=stamp_ns, withdraws=withdraws)
 
     def drive(
         self,
@@ -247,9 +273,9 @@ class Robot:
             for due, arrived in paced(entries, rate_hz):
                 raise_if_asked()
                 motion = None
-                if outside is not None and self._stamp_ns is not None:
-                    motion = outside.between(self._stamp_ns, stamp_of(arrived))
-                found = self.step(arrived, motion=motion, arrived_s=due)
+                if outside is not None and self._time_ns is not None:
+                    motion = outside.between(self._time_ns, stamp_of(arrived))
+                found = self.step(arrived, motion=motion, arrived_s=due, trusted=True)
                 if rate_hz is not None and self._deadline_ms is None:
                     found = replace(found, late=time.perf_counter() > due + 1 / rate_hz)
                 yield found
@@ -259,14 +285,16 @@ class Robot:
 
     def follow(self, arrived: Arrived, *, motion: Motion | OutsideMotion | None = None) -> None:
         """Carries the position on by the motion to this frame, without localising it."""
-        if self._in_order(arrived):
+        placed = self._placed(arrived, trusted=True)
+        if placed is not None:
+            arrived = at_time(arrived, placed.time_ns)
             _, motion = self._front.take(arrived, motion)
             self._localiser.move(motion)
             self._followed(arrived, motion)
 
     def _followed(self, arrived: Arrived, motion: Motion) -> None:
         """Notes a frame of which only the motion is known."""
-        followed = replace(self._left_out(arrived), motion=motion)
+        followed = _unlocalised(stamp_of(arrived), motion, self._localiser.best_position)
         self.track = (*self.track[1 - _REMEMBERED :], followed)
 
     def record(self, reason: str = "asked") -> Path:
@@ -303,6 +331,12 @@ class Robot:
 
         The loop calls it for `Localisation.withdraws`, and so may a caller that knows better.
         """
+        time_ns = self._clock.time_of(found.stamp_ns)
+        known = (one for one in self.track if one.stamp_ns == time_ns)
+        self._withdraw(next(known, replace(found, stamp_ns=time_ns)))
+
+    def _withdraw(self, found: Localisation) -> None:
+        """The same for a result as it is in `track`."""
         track, rests = [], False
         for one in self.track:
             rests = one.stamp_ns == found.stamp_ns or (rests and not one.localised)
@@ -325,6 +359,7 @@ class Robot:
             The position of the previous frame, carried on along the motion to the next one; None
             if unknown or outside these frames.
         """
+        stamp_ns = self._clock.time_of(stamp_ns)
         usable = [one for one in self.track if one.motion.usable]
         after = bisect_left(usable, stamp_ns, key=lambda one: one.stamp_ns)
         if after == len(usable):
@@ -351,6 +386,13 @@ class Robot:
         """Frame and motion; once the doctor has seen enough, an unfit drive is kept no longer."""
         examination = self._front.examination
         waits = self._live is not None and not examination.full
+        behind, self._behind = self._behind, None
+        if behind is not None:
+            since = _since_placed(behind, arrived, motion)
+            if isinstance(since, Motion):
+                motion = since
+            elif since is not None and isinstance(arrived, LoggedFrame):
+                arrived = replace(arrived, odometry=since)
         taken = self._front.take(arrived, motion, clock)
         if self._live is not None and waits and examination.full:
             self._keeper = self._live.examined(self.diagnosis.fatal, self._keeper)
@@ -376,42 +418,26 @@ class Robot:
         self._saving.nodes += found.saved is not None
         return found
 
-    def _in_order(self, arrived: Arrived) -> bool:
-        """Whether the stamp is later than the last one; the first frame begins a live drive."""
-        stamp_ns, last_ns = stamp_of(arrived), self._stamp_ns
-        if last_ns is not None and stamp_ns <= last_ns:
-            self._front.examination.misordered(stamp_ns, last_ns)
-            if not self._set_back(stamp_ns):
-                return False
-        elif last_ns is None and self._live is not None:
-            self._keeper = self._live.begin(arrived)
-        self._early_ns.clear()
-        self._stamp_ns = stamp_ns
-        return True
+    def _placed(self, arrived: Arrived, *, trusted: bool) -> Placed | None:
+        """The frame's stamp with its time; None without. The first one begins a live drive."""
+        placed = self._clock.take(stamp_of(arrived), trusted=trusted)
+        if not placed or placed[-1].step is not None:
+            self._front.examination.evidence.taken = self._clock.report
+        if not placed:
+            return None
+        if self._time_ns is None and self._live is not None:
+            self._keeper = self._live.begin(at_time(arrived, placed[-1].time_ns))
+        self._time_ns = placed[-1].time_ns
+        return placed[-1]
 
-    def _set_back(self, stamp_ns: int) -> bool:
-        """Whether the clock was set back, so that the robot begins anew at this frame."""
-        if self._early_ns and stamp_ns <= self._early_ns[-1]:
-            self._early_ns.clear()
-        self._early_ns.append(stamp_ns)
-        if len(self._early_ns) < _SET_BACK or self._keeper is not KEEPS_NOTHING:
-            return False
-        self._front.restart()
-        self._localiser.lose()
-        self.track = ()
-        return True
-
-    def _left_out(self, arrived: Arrived) -> Localisation:
-        """The result for a frame that is not used."""
-        return Localisation(
-            stamp_ns=stamp_of(arrived),
-            status=LocalisationStatus.NO_ODOMETRY,
-            attempts=0,
-            candidates=0,
-            open_loop_m=0.0,
-            motion=Motion(OdometryStep(OdometryStatus.UNUSABLE_FRAME)),
-            position=self._localiser.best_position,
-        )
+    def _left_out(self, arrived: Arrived, motion: Motion | OutsideMotion | None) -> Localisation:
+        """The result for a frame without a time: where the robot may be by now."""
+        self._behind = _since_placed(self._behind, arrived, motion)
+        guess = self._front.left_out(motion)
+        position = self._localiser.best_position
+        if position is not None:
+            position = None if guess.ahead is None else position.carried_on(*guess.ahead)
+        return _unlocalised(stamp_of(arrived), guess, position)
 
 
 def _word(found: Localisation) -> str:
@@ -419,3 +445,47 @@ def _word(found: Localisation) -> str:
     if found.resumed:
         return "resuming"
     return "saved" if found.saved else found.status.value
+
+
+def _unlocalised(stamp_ns: int, motion: Motion, position: Position | None) -> Localisation:
+    """The result for a frame that is not localised."""
+    return Localisation(
+        stamp_ns=stamp_ns,
+        status=LocalisationStatus.NO_ODOMETRY,
+        attempts=0,
+        candidates=0,
+        open_loop_m=0.0,
+        motion=motion,
+        position=position,
+    )
+
+
+def _since_placed(
+    behind: OdometryStep | Motion | None, arrived: Arrived, motion: Motion | OutsideMotion | None
+) -> OdometryStep | Motion | None:
+    """The motion to a frame past those left out; None where odometry measures it over them."""
+    if isinstance(motion, Motion):
+        return _after(behind, motion) if isinstance(behind, Motion) else motion
+    if isinstance(arrived, LoggedFrame):
+        return compose(behind if isinstance(behind, OdometryStep) else None, arrived.odometry)
+    return None
+
+
+def _after(before: Motion, motion: Motion) -> Motion:
+    """Two successive motions as one; the second alone where one of them is not known."""
+    first, second = before.prev_from_curr, motion.prev_from_curr
+    if first is None or second is None:
+        return motion
+    covariance = None
+    if before.covariance is not None and motion.covariance is not None:
+        covariance = propagate_covariance(first, before.covariance, motion.covariance)
+    guessed_m = math.hypot(before.guessed_m, motion.guessed_m)
+    return replace(
+        motion, prev_from_curr=first @ second, covariance=covariance, guessed_m=guessed_m
+    )
+
+
+def _is_elsewhere(placed: Placed, motion: Motion) -> bool:
+    """Whether stamps went back and images do not go on: another drive, or a simulator's reset."""
+    back = placed.step is not None and placed.step.by_ns < 0
+    return back and motion.guessed_m > 0 and motion.odometry.status is not OdometryStatus.OK

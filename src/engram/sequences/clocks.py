@@ -105,6 +105,11 @@ class StampReport:
         """Stamps left out that are wrong, not only repeated: what was measured then is lost."""
         return self.early + self.ahead
 
+    @property
+    def faulty_share(self) -> float:
+        """Share of the stamps that are faulty."""
+        return self.faulty / self.count if self.count else 0.0
+
     def texts(self, what: str) -> list[str]:
         """For people, a line for each fact; none of a sound clock.
 
@@ -120,6 +125,22 @@ class StampReport:
                 f"such as {self.example}"
             )
         return lines + [f"{what}s: {one.text()}" for one in self.steps]
+
+
+def joined(*reports: StampReport) -> StampReport:
+    """The report of streams that belong together, such as the two sides of a stereo camera.
+
+    A fault of both cameras is one fault: of each count the larger holds. Steps are those of the
+    first stream that has any.
+    """
+    return StampReport(
+        reports[0].count,
+        max(one.repeated for one in reports),
+        max(one.early for one in reports),
+        max(one.ahead for one in reports),
+        next((one.example for one in reports if one.example), ""),
+        next((one.steps for one in reports if one.steps), ()),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,11 +222,25 @@ class SteadyClock:
         return None if self._last is None else self._time_ns
 
     @property
-    def expected_ns(self) -> int | None:
-        """About the time of the newest stamp, with a place or without; None before the first."""
+    def shift_ns(self) -> int:
+        """Time minus stamp, ns, since the newest step."""
+        return self._shift_ns
+
+    @property
+    def expected_ns(self) -> int:
+        """About the time of the newest stamp, with a place or without, ns; 0 before the first."""
         if self._last is None:
-            return None
-        return self._time_ns + round((self._count - 1 - self._last.number) * self._usual_ns(0.0))
+            return 0
+        return self._time_ns + round((self._count - 1 - self._last.number) * self._median_ns)
+
+    def elapsed_ns(self, stamp_ns: int) -> int:
+        """About the time from the newest stamp to the next one, which is not taken yet, ns."""
+        newest = self._waiting[-1] if self._waiting else self._last
+        if newest is None:
+            return 0
+        upcoming = _Stamp(newest.number + 1, stamp_ns, None)
+        goes_on = _rises(newest, upcoming) and not self._is_far(newest, upcoming)
+        return stamp_ns - newest.stamp_ns if goes_on else round(self._median_ns)
 
     @property
     def report(self) -> StampReport:
@@ -213,12 +248,15 @@ class SteadyClock:
         repeated, early, ahead = (self._counts[one] for one in StampFault)
         return StampReport(self._count, repeated, early, ahead, self._example, tuple(self.steps))
 
-    def take(self, stamp_ns: int, received_ns: int | None = None) -> list[Placed]:
+    def take(
+        self, stamp_ns: int, received_ns: int | None = None, *, trusted: bool = False
+    ) -> list[Placed]:
         """Takes the next stamp.
 
         Args:
             stamp_ns: the stamp.
             received_ns: when a recorder received it, by a clock of its own; None if unknown.
+            trusted: whether a reader has looked after it: it is right if it rises.
 
         Returns:
             The stamps that have their place now, this one the last of them; none if it has none.
@@ -226,11 +264,12 @@ class SteadyClock:
         """
         stamp = _Stamp(self._count, stamp_ns, received_ns)
         self._count += 1
-        chain = self._going_on(stamp)
+        last = self._last
+        rises = last is None or _rises(last, stamp)
+        chain = [stamp] if trusted and rises else self._going_on(stamp)
         if chain is None:
             self._wait(stamp)
             return []
-        last = self._last
         if last is not None and (not _rises(last, chain[0]) or self._is_far(last, chain[0])):
             return self._stepped(chain)
         return self._placed(chain)
@@ -261,9 +300,13 @@ class SteadyClock:
         at = bisect_right(self.steps, time_ns, key=lambda one: one.time_ns)
         return time_ns - (self.steps[at - 1].shift_ns if at else 0)
 
+    @property
+    def _median_ns(self) -> float:
+        return median_low(self._intervals_ns) if self._intervals_ns else 0.0
+
     def _usual_ns(self, unknown: float) -> float:
         known = len(self._intervals_ns) >= (1 if self._waits else _KNOWN_FROM)
-        return median_low(self._intervals_ns) if known else unknown
+        return self._median_ns if known else unknown
 
     def _is_far(self, a: _Stamp, b: _Stamp) -> bool:
         """Whether b is ahead of a by more than lost frames usually explain."""

@@ -21,8 +21,14 @@ from engram.graph.model import Clock
 from engram.odometry import MotionSource
 from engram.sequences.calibrating import TELLING, check_no_view, check_sides, read_mask, scaled_by
 from engram.sequences.images import image_bits, image_size, read_image
-from engram.sequences.listing import Listing, PairFiles, usable_pairs
-from engram.sequences.motion import motion_of_files
+from engram.sequences.listing import (
+    Listing,
+    PairFiles,
+    WrongStamp,
+    stamp_report,
+    usable_pairs,
+)
+from engram.sequences.motion import motion_of_files, stamp_facts_of_files
 from engram.sequences.options import Channel, OpenOptions
 from engram.sequences.sequence import SequenceInfo
 from engram.untrusted import printable
@@ -55,6 +61,7 @@ class ImageSequence:
         cameras: its stereo pair, with the rectification of raw images.
         camera: its one camera, rectified.
         frames: the used frames of the drive.
+        stamps: what became of the stamps of the whole drive.
 
     Raises:
         SequenceError: a chosen pair is bad and `skip_bad` is not set, or none is left.
@@ -80,6 +87,7 @@ class ImageSequence:
         self._check_sizes()
         self._mask = None if options.mask is None else read_mask(options.mask, drive.cameras)
         self._reading_faults: list[str] = []
+        self.stamps = stamp_report(drive.places)
         telling = range(len(self._pairs))[TELLING]
         check_sides(drive.cameras, self.usable(telling), drive.path)
 
@@ -104,13 +112,19 @@ class ImageSequence:
 
     @property
     def skipped(self) -> int:
-        """Pairs left out so far under `skip_bad`, in the latest pass through the drive."""
+        """Pairs left out so far under `skip_bad`, in the latest pass; not those by their stamps."""
         return len(self.skipped_reasons)
 
     @property
     def skipped_reasons(self) -> list[str]:
         """Why each of the `skipped` pairs was left out."""
-        return [*self._listing_faults, *self._reading_faults]
+        bad = (one for one in self._listing_faults if not isinstance(one, WrongStamp))
+        return [*bad, *self._reading_faults]
+
+    @property
+    def stamp_facts(self) -> list[str]:
+        """What is wrong with the stamps of images and motion, for people; empty for sound ones."""
+        return [*self.stamps.texts("pair"), *stamp_facts_of_files(self._options.motion)]
 
     def __len__(self) -> int:
         return len(self._pairs)

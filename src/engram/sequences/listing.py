@@ -8,7 +8,6 @@ nanoseconds, without rounding, as whole nanoseconds.
 from __future__ import annotations
 
 import re
-from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -17,7 +16,16 @@ from pathlib import Path
 
 from engram.counts import counted
 from engram.errors import SequenceError
+from engram.sequences.clocks import (
+    ClockStep,
+    StampFault,
+    StampReport,
+    SteadyClock,
+    Timed,
+    in_time,
+)
 from engram.sequences.images import IMAGE_SUFFIXES
+from engram.sequences.pairs import paired
 from engram.untrusted import read_text
 
 # Stamps after the year 2200 are refused: they soon exceed 64 bits.
@@ -32,11 +40,19 @@ _DATE = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:\.(\d{1,12}))?Z?", 
 
 @dataclass(frozen=True, slots=True)
 class PairFiles:
-    """Two image files that make a stereo pair."""
+    """Two image files that make a stereo pair.
+
+    Attributes:
+        stamp_ns: their time by the rule of `engram.sequences.clocks`: the stamp of the left one,
+            unless the clock was set back before.
+        left, right: the files.
+        step: where the clock was set just before the pair; None elsewhere.
+    """
 
     stamp_ns: int
     left: Path
     right: Path
+    step: ClockStep | None = None
 
 
 # A place without a usable pair holds the reason, as text.
@@ -52,20 +68,34 @@ class StampedFile:
     fault: str | None = None
 
 
-class StampFault(str):
-    """The fault of a place whose stamp is not later than the last good one.
+class WrongStamp(str):
+    """The fault of a place that is left out for its stamp, whatever `--skip-bad` says.
 
     Attributes:
-        backwards: whether it is earlier, not equal.
+        fault: what is wrong with it.
     """
 
-    backwards: bool
+    fault: StampFault
 
-    def __new__(cls, text: str, *, backwards: bool) -> StampFault:
+    def __new__(cls, text: str, fault: StampFault) -> WrongStamp:
         """The fault as a text."""
-        fault = super().__new__(cls, text)
-        fault.backwards = backwards
-        return fault
+        wrong = super().__new__(cls, text)
+        wrong.fault = fault
+        return wrong
+
+
+def stamp_report(places: Listing) -> StampReport:
+    """What became of the stamps of a listing."""
+    wrong = [place for place in places if isinstance(place, WrongStamp)]
+    faults = [place.fault for place in wrong]
+    return StampReport(
+        len(places),
+        faults.count(StampFault.REPEATED),
+        faults.count(StampFault.EARLY),
+        faults.count(StampFault.AHEAD),
+        next(iter(wrong), ""),
+        steps=tuple(one.step for one in places if isinstance(one, PairFiles) and one.step),
+    )
 
 
 def read_stamps(path: Path, parse: Callable[[str], int | None]) -> list[int]:
@@ -165,10 +195,8 @@ def pair_by_number(
 ) -> Listing:
     """Listing of a layout in which line i of a file of stamps belongs to image i on both sides."""
     places: list[PairFiles | str] = []
-    faults = _order_faults(
-        stamps_ns, stamps_file, [f"line {at + 1}" for at in range(len(stamps_ns))]
-    )
-    for number, (stamp_ns, fault) in enumerate(zip(stamps_ns, faults, strict=True)):
+    timed = _timed(stamps_ns, [f"line {at + 1}" for at in range(len(stamps_ns))], stamps_file)
+    for number, one in enumerate(timed):
         missing = [
             f"image {number} is missing in {next(iter(side.values())).parent}"
             for side in (left, right)
@@ -177,7 +205,11 @@ def pair_by_number(
         if missing:
             places.append(f"{'; '.join(missing)} ({stamps_file.name} has a stamp for it)")
         else:
-            places.append(fault or PairFiles(stamp_ns, left[number], right[number]))
+            places.append(
+                PairFiles(one.time_ns, left[number], right[number], one.step)
+                if isinstance(one, Timed)
+                else one
+            )
     for number in sorted(number for number in {*left, *right} if number >= len(stamps_ns)):
         extra = " and ".join(str(side[number]) for side in (left, right) if number in side)
         places.append(f"{extra}: extra image, {stamps_file.name} has only {len(stamps_ns)} stamps")
@@ -201,34 +233,41 @@ def pair_by_stamp(
         tolerance_ns: largest difference of stamps within a pair, ns.
         sources: the file or folder that gave the left and the right stamps, for messages.
     """
-    lefts, rights = _in_order(left, sources[0]), _in_order(right, sources[1])
-    right_files = [item for item in rights if isinstance(item, StampedFile)]
-    right_stamps = [file.stamp_ns for file in right_files]
-    taken: set[int] = set()
+    lefts, rights = _timed_files(left, sources[0]), _timed_files(right, sources[1])
+    partners: dict[int, Timed[StampedFile]] = {}
+    alone: list[Timed[StampedFile]] = []
+    sides = [iter([one for one in side if isinstance(one, Timed)]) for side in (lefts, rights)]
+    for one, other in paired(sides[0], sides[1], tolerance_ns):
+        if one is not None and other is not None:
+            partners[one.number] = other
+        elif other is not None:
+            alone.append(other)
+    wrong = [one for one in rights if isinstance(one, WrongStamp)]
+    within = f"within {tolerance_ns / 1e6:g} ms"
     places: list[PairFiles | str] = []
     for item in lefts:
         if isinstance(item, str):
             places.append(item)
-            continue
-        index = _nearest(right_stamps, item.stamp_ns)
-        off_ns = abs(right_stamps[index] - item.stamp_ns) if index is not None else None
-        if index is None or off_ns is None or off_ns > tolerance_ns or index in taken:
-            nearest = "there is none" if off_ns is None else f"the nearest is {off_ns / 1e6:.3f} ms"
-            places.append(
-                f"{item.path}: no right image within {tolerance_ns / 1e6:g} ms ({nearest} off)"
-            )
-            continue
-        taken.add(index)
-        other = right_files[index]
-        faults = [file.fault for file in (item, other) if file.fault]
-        places.append("; ".join(faults) or PairFiles(item.stamp_ns, item.path, other.path))
-    places += [item for item in rights if isinstance(item, str)]
-    places += [
-        f"{file.path}: no left image within {tolerance_ns / 1e6:g} ms"
-        for index, file in enumerate(right_files)
-        if index not in taken
-    ]
+        elif (partner := partners.get(item.number)) is not None:
+            places.append(_pair(item, partner))
+        elif wrong:  # that of its partner
+            places.append(wrong.pop(0))
+        else:
+            off = _nearest_text(item.stamp_ns, rights)
+            places.append(f"{item.item.path}: no right image {within} ({off})")
+    # What is wrong on both sides, or has no partner for that, is one fault.
+    told = sum(isinstance(one, WrongStamp) for one in lefts)
+    places += [one for one in rights if isinstance(one, str) and not isinstance(one, WrongStamp)]
+    places += wrong[told:]
+    places += [f"{one.item.path}: no left image {within}" for one in alone[told:]]
     return places
+
+
+def _pair(left: Timed[StampedFile], right: Timed[StampedFile]) -> PairFiles | str:
+    """A pair, or why it cannot be used."""
+    faults = [one.item.fault for one in (left, right) if one.item.fault]
+    step = left.step or right.step
+    return "; ".join(faults) or PairFiles(left.time_ns, left.item.path, right.item.path, step)
 
 
 def usable_pairs(
@@ -236,15 +275,18 @@ def usable_pairs(
 ) -> tuple[list[PairFiles], list[str]]:
     """The pairs of the chosen places, and the faults of the others.
 
+    Pairs with a wrong stamp are left out in any case.
+
     Raises:
         SequenceError: a chosen place is bad and `skip_bad` is not set, or no pair is left.
     """
     chosen = choose(places)
     reasons = [place for place in chosen if isinstance(place, str)]
+    bad = [one for one in reasons if not isinstance(one, WrongStamp)]
     pairs = [place for place in chosen if isinstance(place, PairFiles)]
-    if reasons and pairs and not skip_bad:
-        more = f" (and {len(reasons) - 1} more such faults)" if len(reasons) > 1 else ""
-        raise SequenceError(f"{reasons[0]}{more}; leave them out with --skip-bad")
+    if bad and pairs and not skip_bad:
+        more = f" (and {len(bad) - 1} more such faults)" if len(bad) > 1 else ""
+        raise SequenceError(f"{bad[0]}{more}; leave them out with --skip-bad")
     if not pairs:
         if places and not chosen:
             raise SequenceError(
@@ -259,31 +301,43 @@ def usable_pairs(
     return pairs, reasons
 
 
-def _in_order(items: Iterable[StampedFile | str], source: Path) -> list[StampedFile | str]:
-    """The items, with a fault in place of those whose stamps do not rise."""
+def _timed_files(
+    items: Iterable[StampedFile | str], source: Path
+) -> list[Timed[StampedFile] | str]:
+    """The items with their times, with a fault in place of those with a wrong stamp."""
     listed = list(items)
     files = [item for item in listed if isinstance(item, StampedFile)]
     names = [f"image {file.path.name}" for file in files]
-    faults = iter(_order_faults([file.stamp_ns for file in files], source, names))
-    return [item if isinstance(item, str) else next(faults) or item for item in listed]
-
-
-def _nearest(stamps_ns: Sequence[int], stamp_ns: int) -> int | None:
-    after = bisect_left(stamps_ns, stamp_ns)
-    around = [index for index in (after - 1, after) if 0 <= index < len(stamps_ns)]
-    return min(around, key=lambda index: abs(stamps_ns[index] - stamp_ns), default=None)
-
-
-def _order_faults(stamps_ns: Sequence[int], source: Path, names: Sequence[str]) -> list[str | None]:
-    """The fault of each stamp that is not above the last good one."""
-    faults: list[str | None] = []
-    last_ns: int | None = None
-    for stamp_ns, name in zip(stamps_ns, names, strict=True):
-        if last_ns is None or stamp_ns > last_ns:
-            last_ns = stamp_ns
-            faults.append(None)
+    timed = iter(_timed([file.stamp_ns for file in files], names, source))
+    found: list[Timed[StampedFile] | str] = []
+    for item in listed:
+        if isinstance(item, str):
+            found.append(item)
             continue
-        how = "repeats the stamp" if stamp_ns == last_ns else "is stamped before the stamp"
-        text = f"{source}: {name} ({stamp_ns} ns) {how} of the one before ({last_ns} ns)"
-        faults.append(StampFault(text, backwards=stamp_ns < last_ns))
-    return faults
+        one = next(timed)
+        if isinstance(one, Timed):
+            found.append(Timed(item, one.number, one.stamp_ns, one.time_ns, one.step))
+        else:
+            found.append(one)
+    return found
+
+
+def _nearest_text(stamp_ns: int, others: Iterable[Timed[StampedFile] | str]) -> str:
+    off_ns = [abs(one.stamp_ns - stamp_ns) for one in others if isinstance(one, Timed)]
+    return f"the nearest is {min(off_ns) / 1e6:.3f} ms off" if off_ns else "there is none"
+
+
+def _timed(
+    stamps_ns: Sequence[int], names: Sequence[str], source: Path
+) -> list[Timed[int] | WrongStamp]:
+    """Each stamp with its time, or its fault."""
+    found: list[Timed[int] | WrongStamp | None] = [None] * len(stamps_ns)
+
+    def left_out(number: int, fault: StampFault) -> None:
+        text = f"{source}: {names[number]} ({stamps_ns[number]} ns) {fault}"
+        found[number] = WrongStamp(text, fault)
+
+    clock = SteadyClock(waits=True, left_out=left_out)
+    for one in in_time(stamps_ns, lambda stamp_ns: stamp_ns, clock):
+        found[one.number] = one
+    return [one for one in found if one is not None]

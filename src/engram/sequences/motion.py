@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from engram.errors import SequenceError
 from engram.geometry import SE3
 from engram.odometry import MotionSource, OutsideMotion
+from engram.sequences.clocks import StampReport, SteadyClock, in_time
 from engram.sequences.listing import nanoseconds, seconds_as_ns
-from engram.sequences.trajectories import read_tum
+from engram.sequences.trajectories import read_poses
 from engram.untrusted import read_text
 
 Vector = NDArray[np.float64]
@@ -170,29 +171,45 @@ def motion_of_files(
     )
 
 
+def stamp_facts_of_files(names: tuple[str, ...]) -> list[str]:
+    """What is wrong with the stamps of files of motion, for people; empty for sound ones."""
+    reports = ((name, timed_samples(Path(name))[1]) for name in names if Path(name).is_file())
+    return [fact for name, report in reports for fact in report.texts(f"sample of {name}")]
+
+
 def read_samples(path: Path) -> list[Sample]:
     """The samples of a file.
 
     Raises:
         SequenceError: it is of no known kind, malformed, or empty.
     """
-    samples = _csv_samples(path) if path.suffix.lower() == ".csv" else _pose_samples(path)
+    return timed_samples(path)[0]
+
+
+def timed_samples(path: Path) -> tuple[list[Sample], StampReport]:
+    """The samples of a file by rising time, and what became of their stamps.
+
+    Raises:
+        SequenceError: it is of no known kind, malformed, or empty.
+    """
+    clock = SteadyClock(waits=True)
+    if path.suffix.lower() == ".csv":
+        timed = in_time(_csv_samples(path), lambda one: one.stamp_ns, clock)
+        samples = [replace(one.item, stamp_ns=one.time_ns) for one in timed]
+    else:
+        samples = _pose_samples(path, clock)
     if not samples:
         raise SequenceError(f"{path}: holds no motion")
-    if any(one.stamp_ns >= then.stamp_ns for one, then in pairwise(samples)):
-        raise SequenceError(f"{path}: its stamps do not increase")
-    return samples
+    return samples, clock.report
 
 
-def _pose_samples(path: Path) -> list[Sample]:
+def _pose_samples(path: Path, clock: SteadyClock) -> list[Sample]:
     """Speeds between the poses of a TUM file: the rig's, in the frame where it began."""
-    track = read_tum(path)
     samples = []
-    for at in range(1, len(track)):
-        seconds = float(track.stamps_ns[at] - track.stamps_ns[at - 1]) / 1e9
-        step = track.world_from_cam[at - 1].inverse() @ track.world_from_cam[at]
-        twist = step.log() / seconds
-        samples.append(Sample(int(track.stamps_ns[at]), twist[:3], twist[3:]))
+    for before, after in pairwise(in_time(read_poses(path), lambda one: one[0], clock)):
+        step = before.item[1].inverse() @ after.item[1]
+        twist = step.log() / ((after.time_ns - before.time_ns) / 1e9)
+        samples.append(Sample(after.time_ns, twist[:3], twist[3:]))
     return samples
 
 

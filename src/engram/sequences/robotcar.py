@@ -27,6 +27,7 @@ from engram.sequences.listing import (
     Listing,
     PairFiles,
     StampedFile,
+    WrongStamp,
     image_files,
     pair_by_stamp,
 )
@@ -78,8 +79,8 @@ def _stamped(side: Path) -> list[StampedFile]:
 
 
 def _without_lone(places: Listing) -> Listing:
-    """The pairs: traversals lack single images here and there, by the data set's documentation."""
-    pairs = [place for place in places if isinstance(place, PairFiles)]
+    """Places of pairs: traversals lack single images here and there, by their documentation."""
+    pairs = [place for place in places if isinstance(place, PairFiles | WrongStamp)]
     return pairs or places
 
 

@@ -65,13 +65,22 @@ def read_tum(path: str | Path) -> Trajectory:
     Raises:
         SequenceError: a line is something else, or the stamps do not rise.
     """
+    return trajectory_of(path, read_poses(path))
+
+
+def read_poses(path: str | Path) -> list[tuple[int, SE3]]:
+    """Stamps, ns, and poses of a file in TUM format, in any order.
+
+    Raises:
+        SequenceError: a line is something else.
+    """
 
     def stamped(fields: list[str]) -> tuple[int, SE3]:
         stamp_ns = known_stamp(seconds_as_ns(fields[0]))
         x, y, z, qx, qy, qz, qw = finite(fields[1:], 7)
         return stamp_ns, SE3.from_quaternion([qw, qx, qy, qz], [x, y, z])
 
-    return trajectory_of(path, read_rows(path, stamped))
+    return read_rows(path, stamped)
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, comments: Sequence[str] = ()) -> None:

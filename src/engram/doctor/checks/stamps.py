@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from engram.doctor.examination import Array, Evidence
@@ -13,14 +15,25 @@ _UNITS_NS = (1, 1_000, 1_000_000, 1_000_000_000)
 _AROUND = 5
 
 
-def backwards(seen: Evidence) -> float | None:
-    """Frames stamped earlier than the frame before."""
-    return float(seen.backwards)
+def faulty_share(seen: Evidence) -> float | None:
+    """Share of the drive's frames that its reader left out for a wrong stamp."""
+    return seen.read.faulty_share
+
+
+def faulty(seen: Evidence) -> float | None:
+    """Frames left out as they are stamped before, or far after, their neighbours."""
+    return float(seen.read.faulty + seen.taken.faulty)
 
 
 def repeated(seen: Evidence) -> float | None:
     """Frames with the stamp of the frame before."""
-    return float(seen.repeated)
+    return float(seen.read.repeated + seen.taken.repeated)
+
+
+def steps(seen: Evidence) -> float | None:
+    """How often the clock was set; not forwards, which cannot be told from a pause."""
+    shifts_ns = [0, *(one.shift_ns for one in (*seen.read.steps, *seen.taken.steps))]
+    return float(sum(a != b for a, b in pairwise(shifts_ns)))
 
 
 def counted(seen: Evidence) -> float | None:

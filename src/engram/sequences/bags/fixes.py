@@ -11,8 +11,8 @@ import numpy as np
 
 from engram.errors import InputError
 from engram.sequences.bags.bag import Bag
-from engram.sequences.bags.messages import Decoder, stamp_of
-from engram.sequences.bags.records import DamageError
+from engram.sequences.bags.messages import Decoder, timed_messages
+from engram.sequences.clocks import SteadyClock
 
 FIX = "sensor_msgs/msg/NavSatFix"
 
@@ -66,15 +66,19 @@ def fix_topics(bag: Bag) -> list[str]:
     return sorted(one.name for one in bag.topics.values() if one.type == FIX and one.count != 0)
 
 
-def fixes_of(bag: Bag, topic: str, decoder: Decoder) -> Iterator[Fix]:
-    """The fixes of a topic in the order of the bag; messages without a fix are left out."""
-    for record in bag.records({topic}):
-        try:
-            message = decoder.message(record, FIX)
-        except DamageError as error:
-            bag.note(f"{topic}: {error}")
-            continue
-        fix = _fix(message, stamp_of(message, record))
+def fixes_of(
+    bag: Bag, topic: str, decoder: Decoder, clock: SteadyClock | None = None
+) -> Iterator[Fix]:
+    """The fixes of a topic by rising time; messages without a fix are left out.
+
+    Args:
+        bag: the bag.
+        topic: the topic.
+        decoder: decodes its messages.
+        clock: has the report on their stamps afterwards.
+    """
+    for one in timed_messages(bag, decoder, topic, clock or SteadyClock(waits=True)):
+        fix = _fix(one.item[0], one.time_ns)
         if fix is not None:
             yield fix
 

@@ -13,7 +13,8 @@ import numpy as np
 from engram.errors import InputError
 from engram.sequences.bags.bag import Bag, files_of
 from engram.sequences.bags.calibrating import read_transforms
-from engram.sequences.bags.messages import Decoder
+from engram.sequences.bags.fixes import FIX
+from engram.sequences.bags.messages import Decoder, clock_of
 from engram.sequences.bags.motion import IMU, ODOMETRY, TWIST
 from engram.sequences.bags.sequence import BagSequence
 from engram.sequences.options import OpenOptions
@@ -64,6 +65,8 @@ class BagFacts:
         command: the command that maps the bag.
         notes: what was read otherwise than it is written.
         lost: what could not be read.
+        stamps: what is wrong with the stamps of images, motion and fixes, for people.
+        faulty_share: share of the left images that are left out for a wrong stamp.
     """
 
     path: str
@@ -81,6 +84,8 @@ class BagFacts:
     command: str
     notes: list[str]
     lost: list[str]
+    stamps: list[str]
+    faulty_share: float
 
 
 def describe_bag(path: Path, options: OpenOptions | None = None) -> BagFacts:
@@ -116,6 +121,7 @@ def describe_bag(path: Path, options: OpenOptions | None = None) -> BagFacts:
         _command(path, options, topics, drive, question),
         [] if drive is None else drive.notes,
         bag.lost,
+        *_stamps(bag, drive),
     )
 
 
@@ -145,6 +151,19 @@ def _topics(bag: Bag) -> tuple[list[TopicFacts], int, int]:
         )
     every = [stamp for found in stamps.values() for stamp in found]
     return facts, min(every, default=0), max(every, default=0)
+
+
+def _stamps(bag: Bag, drive: BagSequence | None) -> tuple[list[str], float]:
+    """What is wrong with stamps, for people, and the share of images that are left out for it."""
+    facts, share = [], 0.0
+    if drive is not None:
+        share = drive.read_stamps().faulty_share
+        facts += drive.stamp_facts
+    decoder = Decoder(bag.is_ros1)
+    for topic in sorted(bag.topics.values(), key=lambda one: one.name):
+        if topic.type in {ODOMETRY, TWIST, IMU, FIX}:
+            facts += clock_of(bag, decoder, topic.name).report.texts(f"message of {topic.name}")
+    return facts, share
 
 
 def _opened(path: Path, options: OpenOptions) -> tuple[BagSequence | None, str]:

@@ -12,8 +12,9 @@ from engram.errors import SequenceError
 from engram.geometry import SE3
 from engram.sequences.bags.bag import Bag
 from engram.sequences.bags.calibrating import Transforms
-from engram.sequences.bags.messages import Decoder, stamp_of
+from engram.sequences.bags.messages import Decoder, timed_messages
 from engram.sequences.bags.records import DamageError
+from engram.sequences.clocks import SteadyClock
 from engram.sequences.motion import RigMotion, Sample, read_samples
 
 ODOMETRY, TWIST, IMU = (
@@ -33,6 +34,9 @@ class BagMotion:
         transforms: static transforms, for the axes of the gyroscope.
         cam_from_rig: mounting of the camera, if known.
 
+    Attributes:
+        clocks: of the topics' stamps, in the latest pass.
+
     Raises:
         SequenceError: a name is neither a topic with motion nor a file, or two are of a kind.
     """
@@ -46,6 +50,7 @@ class BagMotion:
         cam_from_rig: SE3 | None,
     ) -> None:
         self._bag, self._decoder, self._cam_from_rig = bag, decoder, cam_from_rig
+        self.clocks: dict[str, SteadyClock] = {}
         self._sources: dict[bool, str] = {}
         for name in names:
             is_gyro = self._is_gyro(name)
@@ -54,6 +59,11 @@ class BagMotion:
                 raise SequenceError(f"--motion {name}: is a second {kind}; give one of each kind")
             self._sources[is_gyro] = name
         self._rig_from_gyro = self._axes(transforms)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Files beside the bag that it reads."""
+        return tuple(one for one in self._sources.values() if one not in self._bag.topics)
 
     def source(self, shift_ns: int) -> RigMotion | None:
         """A new pass through the motion; None without one."""
@@ -105,16 +115,10 @@ class BagMotion:
         if topic is None:
             yield from read_samples(Path(name))
             return
-        last_ns, last_pose = -1, None
-        for record in self._bag.records({name}):
-            try:
-                message = self._decoder.message(record, topic.type)
-            except DamageError as error:
-                self._bag.note(f"{name}: {error}")
-                continue
-            stamp_ns = stamp_of(message, record)
-            if stamp_ns <= last_ns:
-                continue
+        clock = self.clocks[name] = SteadyClock(waits=True)
+        last_ns, last_pose = 0, None
+        for one in timed_messages(self._bag, self._decoder, name, clock):
+            message, stamp_ns = one.item[0], one.time_ns
             if topic.type == IMU:
                 sample = Sample(stamp_ns, None, _vector(message.angular_velocity))
             else:

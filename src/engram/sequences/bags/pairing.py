@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import numpy as np
 
 from engram.counts import counted
 from engram.errors import SequenceError
+from engram.sequences.clocks import StampReport, SteadyClock, Timed, in_time, joined
+from engram.sequences.pairs import paired
 
 T = TypeVar("T")
 
@@ -26,12 +28,14 @@ class Shot(Generic[T]):
     Attributes:
         number: its place on the topic, from 0.
         stamp_ns: capture time, ns.
-        content: the image, however it is stored; a text says why it cannot be used.
+        received_ns: when the recorder received it, ns.
+        content: the image, however it is stored.
     """
 
     number: int
     stamp_ns: int
-    content: T | str
+    received_ns: int
+    content: T
 
 
 @dataclass(slots=True)
@@ -44,7 +48,7 @@ class Pairing:
         paired: pairs of one instant.
         largest_offset_ns: largest offset among them.
         unusable: images that could not be decoded or do not fit.
-        backwards: images whose stamp does not rise.
+        clocks: of the left and of the right stamps.
     """
 
     tolerance_ns: int
@@ -53,7 +57,14 @@ class Pairing:
     paired: int = 0
     largest_offset_ns: int = 0
     unusable: int = 0
-    backwards: int = 0
+    clocks: tuple[SteadyClock, SteadyClock] = field(
+        default_factory=lambda: (SteadyClock(waits=True), SteadyClock(waits=True))
+    )
+
+    @property
+    def stamps(self) -> StampReport:
+        """What became of the stamps of the left images, and of right ones without theirs."""
+        return joined(*(clock.report for clock in self.clocks))
 
     def text(self) -> str:
         """For people, in one line."""
@@ -63,10 +74,6 @@ class Pairing:
             f"{self.largest_offset_ns / 1e6:.3f} ms apart (tolerance "
             f"{self.tolerance_ns / 1e6:.3f} ms)"
         ]
-        if self.backwards:
-            facts.append(
-                f"{counted(self.backwards, 'image')} left out whose stamp does not increase"
-            )
         if self.unusable:
             facts.append(f"{counted(self.unusable, 'image')} could not be used")
         return "; ".join(facts)
@@ -89,7 +96,9 @@ def learnt_tolerance(left_ns: Sequence[int], right_ns: Sequence[int], most_ns: i
     after = np.searchsorted(right, left).clip(1, max(len(right) - 1, 1))
     around = np.stack([right[(after - 1).clip(0)], right[after.clip(0, len(right) - 1)]])
     offsets = np.abs(around - left).min(axis=0)
-    interval_ns = int(np.median(np.diff(left))) if len(left) > 1 else 2 * most_ns
+    rising_ns = np.diff(np.array(left_ns, np.int64))
+    rising_ns = rising_ns[rising_ns > 0]  # where a clock was set back, others lie between
+    interval_ns = int(np.median(rising_ns)) if len(rising_ns) else 2 * most_ns
     most_ns = min(most_ns, max(interval_ns // 2, 1))
     near = offsets[offsets <= most_ns]
     if not len(near):
@@ -104,8 +113,8 @@ def learnt_tolerance(left_ns: Sequence[int], right_ns: Sequence[int], most_ns: i
 
 def pairs_of(
     left: Iterator[Shot[T]], right: Iterator[Shot[T]], pairing: Pairing
-) -> Iterator[tuple[Shot[T], Shot[T] | None]]:
-    """Each left image whose stamp rises, with the nearest right one within the tolerance.
+) -> Iterator[tuple[Timed[Shot[T]], Shot[T] | None]]:
+    """Each left image that has a time, with the right one of its instant.
 
     Both topics are read side by side, so that memory stays flat whatever the order of the bag.
 
@@ -113,29 +122,16 @@ def pairs_of(
         left, right: the images of each topic.
         pairing: counts what becomes of them.
     """
-    rights = _rising(right, pairing, "right")
-    waiting = next(rights, None)
-    for shot in _rising(left, pairing, "left"):
-        while waiting is not None and waiting.stamp_ns < shot.stamp_ns - pairing.tolerance_ns:
-            waiting = next(rights, None)
-        if waiting is None or waiting.stamp_ns > shot.stamp_ns + pairing.tolerance_ns:
-            yield shot, None
+    timed = [
+        in_time(shots, lambda one: one.stamp_ns, clock, lambda one: one.received_ns)
+        for shots, clock in zip((left, right), pairing.clocks, strict=True)
+    ]
+    for shot, other in paired(timed[0], timed[1], pairing.tolerance_ns):
+        if shot is None:
             continue
-        offset_ns = abs(waiting.stamp_ns - shot.stamp_ns)
-        pairing.paired += 1
-        pairing.largest_offset_ns = max(pairing.largest_offset_ns, offset_ns)
-        yield shot, waiting
-        waiting = next(rights, None)
-    for _ in rights:
-        pass  # so that they are counted
-
-
-def _rising(shots: Iterator[Shot[T]], pairing: Pairing, side: str) -> Iterator[Shot[T]]:
-    last_ns: int | None = None
-    for shot in shots:
-        setattr(pairing, side, getattr(pairing, side) + 1)
-        if last_ns is not None and shot.stamp_ns <= last_ns:
-            pairing.backwards += 1
-            continue
-        last_ns = shot.stamp_ns
-        yield shot
+        if other is not None:
+            pairing.paired += 1
+            offset_ns = abs(other.stamp_ns - shot.stamp_ns)
+            if offset_ns <= pairing.tolerance_ns:
+                pairing.largest_offset_ns = max(pairing.largest_offset_ns, offset_ns)
+        yield shot, None if other is None else other.item

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -29,15 +29,17 @@ from engram.sequences.bags.calibrating import (
     with_constant,
 )
 from engram.sequences.bags.fixes import Fix, fix_topics, fixes_of
-from engram.sequences.bags.messages import Decoder, stamp_of
+from engram.sequences.bags.messages import Decoder, Stamps
 from engram.sequences.bags.motion import BagMotion
 from engram.sequences.bags.pairing import Pairing, Shot, learnt_tolerance, pairs_of
 from engram.sequences.bags.pictures import depth_of, grey_of, size_of
 from engram.sequences.bags.records import DamageError
 from engram.sequences.bags.topics import StereoTopics, only_topic, same_images, stereo_topics
 from engram.sequences.calibrating import TELLING, check_no_view, check_sides, read_mask
+from engram.sequences.clocks import StampReport, SteadyClock, in_time
 from engram.sequences.euroc import YEAR_2000_NS
 from engram.sequences.image_sequence import Side, half, rectified, with_options
+from engram.sequences.motion import stamp_facts_of_files
 from engram.sequences.options import OpenOptions
 from engram.sequences.sequence import SequenceInfo
 
@@ -58,7 +60,8 @@ class BagSequence:
     """A `StereoSequence` over a ROS bag, read as a stream: memory does not grow with the bag.
 
     Images that cannot be decoded, or have no partner of their instant, are left out and counted;
-    damaged parts of the file are reported in `lost`.
+    damaged parts of the file are reported in `lost`. A pair's stamp is its time by the rule of
+    `engram.sequences.clocks`: that of the left image, unless the clock was set back before.
 
     Attributes:
         info: what is known of the drive as a whole.
@@ -83,6 +86,11 @@ class BagSequence:
         self.topics = self._stereo_topics(given)
         if given is not None and self.topics.are_rectified and given.rectification is not None:
             given = self._given(options, rectified=True)
+        self._reasons: dict[str, list[str]] = {}
+        self._stamps = {
+            topic: Stamps(self._bag, self._decoder, topic)
+            for topic in (self.topics.left, self.topics.right)
+        }
         tolerance_ns, self._first_ns = self._learn()
         self.pairing = Pairing(tolerance_ns)
         self._static = read_transforms(self._bag, self._decoder)
@@ -103,7 +111,7 @@ class BagSequence:
             transforms,
             self.camera.cam_from_rig,
         )
-        self._reasons: dict[str, list[str]] = {}
+        self._fix_clocks: dict[str, SteadyClock] = {}
         self._bits = self._depth()
         if self.cameras.sides_doubtful:
             telling = islice(self, TELLING.start, TELLING.stop, TELLING.step)
@@ -120,14 +128,15 @@ class BagSequence:
         names = fix_topics(self._bag)
         if len(names) != 1:
             return None
-        found = fixes_of(self._bag, names[0], self._decoder)
+        clock = self._fix_clocks[names[0]] = SteadyClock(waits=True)
+        found = fixes_of(self._bag, names[0], self._decoder, clock)
         return (replace(one, time_ns=one.time_ns + self._shift_ns) for one in found)
 
     @property
     def frame(self) -> str:
         """Name of the left camera's frame, of its first image or `CameraInfo`; "" without one."""
         first = next(self._shots(self.topics.left), None)
-        named = "" if first is None or isinstance(first.content, str) else _frame(first.content)
+        named = "" if first is None else _frame(first.content)
         if named:
             return named
         try:
@@ -145,6 +154,29 @@ class BagSequence:
     def skipped(self) -> int:
         """Images left out so far, in the latest pass, as damaged or of another size."""
         return self.pairing.unusable
+
+    @property
+    def stamps(self) -> StampReport:
+        """What became of the stamps of its images, in the latest pass."""
+        return self.pairing.stamps
+
+    def read_stamps(self) -> StampReport:
+        """Reads the stamps of all images, without decoding them."""
+        self.pairing = Pairing(self.pairing.tolerance_ns)
+        for _ in pairs_of(self._met(Side.LEFT), self._met(Side.RIGHT), self.pairing):
+            pass
+        return self.stamps
+
+    @property
+    def stamp_facts(self) -> list[str]:
+        """What was wrong with the stamps of images, motion and fixes, for people."""
+        sides = zip(("left", "right"), self.pairing.clocks, strict=True)
+        reports = {f"{side} image": clock.report for side, clock in sides}
+        for topic, clock in {**self._motion.clocks, **self._fix_clocks}.items():
+            reports[f"message of {topic}"] = clock.report
+        named = self._motion.files
+        facts = [fact for what, report in reports.items() for fact in report.texts(what)]
+        return facts + stamp_facts_of_files(named)
 
     @property
     def skipped_reasons(self) -> list[str]:
@@ -187,17 +219,18 @@ class BagSequence:
         self.pairing = Pairing(self.pairing.tolerance_ns)
         self._reasons.clear()
         frames, times, used = self._options.frames, self._options.times, 0
-        sides = (self._shots(self.topics.left), self._shots(self.topics.right))
+        sides = (self._met(Side.LEFT), self._met(Side.RIGHT))
         for left, right in pairs_of(*sides, self.pairing):
-            if frames.stop is not None and left.number >= frames.stop:
+            number = left.item.number
+            if frames.stop is not None and number >= frames.stop:
                 break
-            if times.is_after(left.stamp_ns, self._first_ns):
+            if times.is_after(left.time_ns, self._first_ns):
                 break
-            if right is None or left.number not in frames.indices(left.number + 1):
+            if right is None or number not in frames.indices(number + 1):
                 continue
-            if times.is_before(left.stamp_ns, self._first_ns):
+            if times.is_before(left.time_ns, self._first_ns):
                 continue
-            pair = self._decoded(left, right)
+            pair = self._decoded(left.time_ns, left.item, right)
             if pair is not None:
                 used += 1
                 yield pair
@@ -208,25 +241,26 @@ class BagSequence:
                 f"{self.pairing.right} right images{why}"
             )
 
-    def _decoded(self, left: Shot[Any], right: Shot[Any]) -> StereoPair | None:
+    def _decoded(self, time_ns: int, left: Shot[Any], right: Shot[Any]) -> StereoPair | None:
         """The pair; None if an image of it is damaged or does not fit."""
         table = self.cameras.rectification
         try:
             image = self._image(self.topics.left, left, Side.LEFT, table and table.left)
             other = self._image(self.topics.right, right, Side.RIGHT, table and table.right)
         except SequenceError as error:
-            self.pairing.unusable += 1
             self.pairing.paired -= 1
-            reason = _PLACE.sub(": ", str(error), count=1)
-            if reason in self._reasons or len(self._reasons) < _MOST_REASONS:
-                self._reasons.setdefault(reason, []).append(str(error))
+            self._unusable(str(error))
             return None
-        return StereoPair(left.stamp_ns + self._shift_ns, image, other, self.camera, self._mask)
+        return StereoPair(time_ns + self._shift_ns, image, other, self.camera, self._mask)
+
+    def _unusable(self, reason: str) -> None:
+        self.pairing.unusable += 1
+        place = _PLACE.sub(": ", reason, count=1)
+        if place in self._reasons or len(self._reasons) < _MOST_REASONS:
+            self._reasons.setdefault(place, []).append(reason)
 
     def _image(self, topic: str, shot: Shot[Any], side: Side, table: Any) -> NDArray[np.uint8]:
         where = f"{topic}: image {shot.number}"
-        if isinstance(shot.content, str):
-            raise SequenceError(f"{where} {shot.content}")
         halves = self.topics.are_halves
         size = (self.camera.width * (1 + halves), self.camera.height)
         image = grey_of(shot.content, where, size, self._options.channel, self._bits)
@@ -234,49 +268,63 @@ class BagSequence:
             image = half(image, side)
         return image if table is None else rectified(image, table)
 
-    def _shots(self, topic: str) -> Iterator[Shot[Any]]:
-        """The images of a topic, decoded to messages but not to pixels."""
-        kind = self._bag.topics[topic].type
+    def _shots(
+        self, topic: str, damaged: Callable[[str], None] = lambda _: None
+    ) -> Iterator[Shot[Any]]:
+        """The images of a topic, decoded to messages but not to pixels.
+
+        Args:
+            topic: the topic.
+            damaged: called with why an image cannot be read.
+        """
+        kind, stamps = self._bag.topics[topic].type, self._stamps.get(topic)
+        stamps = stamps or Stamps(self._bag, self._decoder, topic)
         for number, record in enumerate(self._bag.records({topic})):
             try:
                 message = self._decoder.message(record, kind)
             except DamageError as error:
-                yield Shot(number, record.received_ns, str(error))
+                damaged(f"{topic}: image {number} {error}")
             else:
-                yield Shot(number, stamp_of(message, record), message)
+                stamp_ns = stamps.of(message, record)
+                yield Shot(number, stamp_ns, record.received_ns, message)
+
+    def _met(self, side: Side) -> Iterator[Shot[Any]]:
+        """The images of a side, as they are counted in this pass."""
+        topic = self.topics.left if side is Side.LEFT else self.topics.right
+
+        def damaged(reason: str) -> None:
+            setattr(self.pairing, side, getattr(self.pairing, side) + 1)
+            self._unusable(reason)
+
+        for shot in self._shots(topic, damaged):
+            setattr(self.pairing, side, getattr(self.pairing, side) + 1)
+            yield shot
 
     def _learn(self) -> tuple[int, int]:
-        """Tolerance of pairs and first stamp of the left images, ns."""
-        stamps = [
-            [
-                shot.stamp_ns
-                for shot in islice(self._shots(topic), _LEARNT_FROM)
-                if not isinstance(shot.content, str)
-            ]
-            for topic in (self.topics.left, self.topics.right)
-        ]
-        for topic, found in zip((self.topics.left, self.topics.right), stamps, strict=True):
-            if not found:
-                first = next(self._shots(topic), None)
-                why = "no image can be read" if first is None else f"image 0 {first.content}"
+        """Tolerance of pairs and first time of the left images, ns."""
+        stamps, first_ns = [], 0
+        for topic in (self.topics.right, self.topics.left):
+            why: list[str] = []
+            shots = islice(self._shots(topic, why.append), _LEARNT_FROM)
+            timed = list(in_time(shots, lambda one: one.stamp_ns, SteadyClock(waits=True)))
+            if not timed:
                 lost = "".join(f"; {one}" for one in self._bag.lost[:1])
-                raise SequenceError(f"{self._bag.path}: {topic}: {why}{lost}")
+                fault = why[0] if why else f"{topic}: no image can be read"
+                raise SequenceError(f"{self._bag.path}: {fault}{lost}")
+            stamps.append([one.stamp_ns for one in timed])
+            first_ns = timed[0].time_ns
         try:
             most_ns = self._options.pair_tolerance_ns
-            tolerance_ns = learnt_tolerance(stamps[0], stamps[1], most_ns)
+            tolerance_ns = learnt_tolerance(stamps[1], stamps[0], most_ns)
         except SequenceError as error:
             raise SequenceError(f"{self._bag.path}: {self.topics}: {error}") from error
-        return tolerance_ns, min(stamps[0])
+        return tolerance_ns, first_ns
 
     def _depth(self) -> int:
         """Bits that the cameras use of 16-bit images, by the first ones of both."""
         return max(
             depth_of(
-                (
-                    shot.content
-                    for shot in islice(self._shots(topic), _BITS_FROM)
-                    if not isinstance(shot.content, str)
-                ),
+                (shot.content for shot in islice(self._shots(topic), _BITS_FROM)),
                 topic,
             )
             for topic in (self.topics.left, self.topics.right)
@@ -335,16 +383,14 @@ class BagSequence:
         return (width // 2, height) if topics.are_halves else (width, height)
 
     def _first_size(self, left: str) -> tuple[int, int]:
-        fault = "no image can be read"
-        for shot in islice(self._shots(left), _LEARNT_FROM):
-            if isinstance(shot.content, str):
-                fault = shot.content
-                continue
+        why: list[str] = []
+        for shot in islice(self._shots(left, why.append), _LEARNT_FROM):
             try:
                 return size_of(shot.content, left)
             except SequenceError as error:
-                fault = str(error)
-        raise SequenceError(f"{self._bag.path}: {left}: {fault}")
+                why.append(str(error))
+        fault = why[-1] if why else f"{left}: no image can be read"
+        raise SequenceError(f"{self._bag.path}: {fault}")
 
 
 def _are_two(size: tuple[int, int], camera: StereoCamera) -> bool:
