@@ -11,7 +11,7 @@ import pytest
 
 from engram.maps import open_map
 
-UNFIT = 4
+UNFIT, EXIT_DAMAGED = 4, 3
 
 
 @pytest.fixture
@@ -82,8 +82,34 @@ def test_stamps_out_of_order_are_a_finding_not_an_error(engram, street: Path, tm
     stamps[6], stamps[7] = stamps[7], stamps[6]
     (folder / "times.txt").write_text("\n".join(stamps))
     ran = engram("doctor", folder, "--json")
-    assert ran.status == UNFIT
+    assert ran.status == 0
     assert ran.json["findings"][0]["code"] == "stamps_backwards"
+    assert "1 of" in ran.err
+    assert "left out for the stamp" in ran.err
+    mapped = engram("map", tmp_path / "m.engram", folder)
+    assert mapped.status == 0
+    assert f"{len(stamps) - 1} frames" in mapped.out
+
+
+def test_a_drive_with_many_wrong_stamps_is_fatal_to_the_doctor_and_mapped_all_the_same(
+    engram, street: Path, tmp_path
+) -> None:
+    folder = tmp_path / "zeros"
+    shutil.copytree(street, folder)
+    stamps = (folder / "times.txt").read_text().splitlines()
+    wrong = range(3, len(stamps), 6)
+    for number in wrong:
+        stamps[number] = "0"
+    (folder / "times.txt").write_text("\n".join(stamps))
+    ran = engram("doctor", folder, "--json")
+    assert ran.status == UNFIT
+    assert "stamps_unreliable" in {one["code"] for one in ran.json["findings"]}
+    told = engram("drive", "info", folder)
+    assert told.status == EXIT_DAMAGED
+    assert f"{len(wrong)} of {len(stamps)} pairs left out for the stamp" in told.out
+    mapped = engram("map", tmp_path / "m.engram", folder)
+    assert mapped.status == EXIT_DAMAGED
+    assert f"{len(stamps) - len(wrong)} frames" in mapped.out
 
 
 def test_an_unfit_drive_is_mapped_only_by_force_and_the_revision_says_so(

@@ -60,13 +60,10 @@ def pairs() -> list[StereoPair]:
 def examined(pairs: Sequence[StereoPair], facts: Facts | None = None) -> Diagnosis:
     front = Front(Settings())
     front.examination.evidence.facts = facts or Facts()
-    last_ns = None
     for pair in pairs:
-        if last_ns is not None and pair.stamp_ns <= last_ns:
-            front.examination.misordered(pair.stamp_ns, last_ns)
-            continue
-        front.take(pair)
-        last_ns = pair.stamp_ns
+        if front.clock.take(pair.stamp_ns):
+            front.take(pair)
+    front.examination.evidence.taken = front.clock.report
     return front.diagnosis
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -374,15 +375,96 @@ def test_a_closed_robot_leaves_no_threads(path: Path) -> None:
     assert threading.active_count() == before
 
 
+SECOND_NS = 10**9
+
+
+def shifted(drive: list[Seen], first: int, by_s: float, last: int | None = None) -> list[Seen]:
+    """A drive whose stamps are off from one frame on, to before another."""
+    by_ns = [
+        round(by_s * SECOND_NS) if first <= at < (last or len(drive)) else 0
+        for at in range(len(drive))
+    ]
+    return [
+        replace(one, frame=replace(one.frame, stamp_ns=one.frame.stamp_ns + off_ns))
+        for one, off_ns in zip(drive, by_ns, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("keeps", [{"maps": True}, {"remembers": True}, {}])
+@pytest.mark.parametrize("by_s", [-0.5, -3600.0, 3600.0])
+@pytest.mark.parametrize("at", [1, 30])
+def test_a_clock_that_is_set_costs_two_frames_and_never_the_drive(
+    path: Path, keeps: dict[str, bool], by_s: float, at: int
+) -> None:
+    mapped(path)
+    taken = shifted(AGAIN, at, by_s)
+    with open_map(path) as town, town.robot(CAMERA, name="r2", **keeps) as robot:
+        found = [robot.step(seen.logged) for seen in taken]
+        lost = [k for k, one in enumerate(found) if one.status == "no_odometry"]
+        assert set(lost) <= {at, at + 1}
+        assert [one.stamp_ns for one in found] == [one.frame.stamp_ns for one in taken]
+        late = found[at + 3 :]
+        assert sum(one.localised for one in late) >= 0.9 * len(late)
+        assert not robot.diagnosis.fatal
+        assert "clock_set" in {one.code for one in robot.diagnosis.findings} or by_s > 0
+    if keeps:
+        assert robot.saving.state is SavingState.COMMITTED
+    assert check_file(path).sound
+
+
+@pytest.mark.parametrize("by_s", [-3600.0, 0.5, 3600.0])
+@pytest.mark.parametrize("at", [1, 35])
+@pytest.mark.parametrize("maps", [True, False])
+def test_one_wrong_stamp_costs_its_own_frame(path: Path, by_s: float, at: int, *, maps) -> None:
+    mapped(path)
+    taken = shifted(AGAIN, at, by_s, at + 1)
+    with open_map(path) as town, town.robot(CAMERA, name="r2", maps=maps) as robot:
+        found = [robot.step(seen.logged) for seen in taken]
+    lost = {k for k, one in enumerate(found) if one.status == "no_odometry"}
+    assert lost <= {at}
+    codes = {one.code for one in robot.diagnosis.findings}
+    assert codes & {"stamps_backwards", "clock_set", "stamp_jump"} or not lost
+
+
+def test_a_position_that_is_not_followed_does_not_stay_sharp(path: Path) -> None:
+    """A clock that stands still for good: nothing places the frames any more."""
+    mapped(path)
+    stuck = [
+        replace(one, frame=replace(one.frame, stamp_ns=AGAIN[10].frame.stamp_ns))
+        for one in AGAIN[11:]
+    ]
+    with open_map(path) as town, town.robot(CAMERA) as robot:
+        known = [robot.step(seen.logged) for seen in AGAIN[:11]][-1]
+        blind = [robot.step(seen.logged) for seen in stuck]
+    assert known.position is not None
+    assert {one.status.value for one in blind} == {"no_odometry"}
+    for gone, one in enumerate(blind, start=1):
+        assert one.position is not None
+        way_m = np.linalg.norm(
+            one.position.node_from_live.translation - known.position.node_from_live.translation
+        )
+        assert one.position.sigma_m > known.position.sigma_m
+        # It goes on at the last speed, and says how far that may be off.
+        assert abs(way_m - 0.7 * gone) < 3 * one.position.sigma_m
+
+
+def numbered(drive: list[Seen]) -> list[Seen]:
+    """A drive that no doctor lets pass: its stamps are milliseconds, one a frame."""
+    return [
+        replace(one, frame=replace(one.frame, stamp_ns=number * 1_000_000))
+        for number, one in enumerate(drive)
+    ]
+
+
 def test_what_an_unfit_robot_mapped_waits_and_is_not_committed(path: Path) -> None:
     with (
         open_map(path, create=True) as town,
         town.robot(CAMERA, name="r1", maps=True) as robot,
     ):
-        run(robot, [*FIRST[:12], FIRST[3], *FIRST[12:]])
+        run(robot, numbered(FIRST))
     assert robot.saving.state is SavingState.UNCOMMITTED
     assert robot.saving.state == "uncommitted"
-    assert "stamps run backwards" in robot.saving.text()
+    assert "the stamps are the numbers of the frames" in robot.saving.text()
     assert "engram check --seal" in robot.saving.text()
     with open_map(path) as town:
         assert town.revision == 0
@@ -400,7 +482,7 @@ def test_an_unfit_robot_stops_mapping_when_the_doctor_has_seen_enough(path: Path
         open_map(path, create=True) as town,
         town.robot(CAMERA, settings, name="r1", maps=True) as robot,
     ):
-        words = run(robot, [*FIRST[:12], FIRST[3], *FIRST[12:]])
+        words = run(robot, numbered(FIRST))
         assert robot.saving.state is SavingState.UNCOMMITTED
     assert "saved" in words[:14]
     assert "saved" not in words[16:]
@@ -412,9 +494,9 @@ def test_an_unfit_robot_stops_mapping_when_the_doctor_has_seen_enough(path: Path
 def test_what_an_unfit_robot_remembers_is_dropped(path: Path) -> None:
     mapped(path)
     with open_map(path) as town, town.robot(CAMERA, name="r2", remembers=True) as robot:
-        run(robot, [*AGAIN[:12], AGAIN[3], *AGAIN[12:]])
+        run(robot, numbered(AGAIN))
     assert robot.saving.state is SavingState.UNCOMMITTED
-    assert "stamps run backwards" in robot.saving.reason
+    assert "the stamps are the numbers of the frames" in robot.saving.reason
     assert "--seal" not in robot.saving.text()
     with open_map(path) as town:
         assert town.revision == 1

@@ -42,6 +42,10 @@ _NEWEST_INTERVALS = 15
 _USUAL_RATIO = 2.5
 # What is ahead by more than both, in usual intervals and ns, is no lost frames until confirmed.
 _FAR_RATIO, _FAR_NS = 10, 1_000_000_000
+# One or two stamps at either end of a drive are wrong if they are off by more than both.
+_LONE_NS = 10_000_000_000
+# Of the first two items an interval is not known yet: cameras take ten images a second.
+_UNKNOWN_NS = 100_000_000
 # A receiver noticed no pause if its own interval was shorter, in its usual ones.
 _RECEIVED_RATIO = 3
 
@@ -282,8 +286,10 @@ class SteadyClock:
         if last is None:
             chains = [_longest(waiting[: n + 1], _rises) for n in range(len(waiting))]
             return self._placed(max(chains, key=len))
-        near = [one for one in waiting if _rises(last, one) and not self._is_far(last, one)]
-        return self._placed(near[:1])
+        near = partial(_follows, usual_ns=self._usual_ns(inf), far_ns=_LONE_NS)
+        if all(near(a, b) for a, b in pairwise([last, *waiting])):
+            return self._placed(waiting[:])
+        return self._placed([one for one in waiting if near(last, one)][:1])
 
     def time_of(self, stamp_ns: int) -> int:
         """The time of a stamp of the newest stretch that holds it, else of the newest of all."""
@@ -319,7 +325,9 @@ class SteadyClock:
             return self._beginning(known) if self._waits else [stamp]
         usual_ns = self._usual_ns(inf)
         follows = partial(_follows, usual_ns=usual_ns)
+        rising = all(_rises(a, b) for a, b in pairwise([last, *known]))
         since = _longest([last, *known], follows, first=last)[1:]
+        since = known if since and rising else since
         chain = _longest(known, follows)
         if since and (len(chain) < max(_CONFIRMED, len(since) + 1) or not self._waits):
             doubtful = stamp.stamp_ns - last.stamp_ns > _USUAL_RATIO * usual_ns
@@ -327,8 +335,7 @@ class SteadyClock:
         if not since and self._returns(stamp):
             return [stamp]
         if len(chain) >= _CONFIRMED:
-            return chain
-        rising = all(_rises(a, b) for a, b in pairwise([last, *known]))
+            return known if rising else chain
         if (rising and len(known) >= _IRREGULAR) or len(known) >= _MOST_WAITING:
             chain = _longest(known, _rises)
             return chain if len(chain) >= _CONFIRMED else None
@@ -341,8 +348,12 @@ class SteadyClock:
             usual_ns = _per_item_ns(before, stamp)
             alike = partial(_alike, usual_ns=usual_ns)
             if usual_ns > 0 and len(chain := _longest(known, alike)) >= _CONFIRMED:
+                follows = partial(_follows, usual_ns=usual_ns)
+                near = partial(_follows, usual_ns=usual_ns, far_ns=_LONE_NS)
+                if all(near(a, b) for a, b in pairwise(known)):
+                    return known
                 earlier = known[: known.index(chain[0]) + 1]
-                return _longest(earlier, partial(_follows, usual_ns=usual_ns)) + chain[1:]
+                return _longest(earlier, follows) + chain[1:]
         return _longest(known, _rises) if len(known) >= _MOST_WAITING else None
 
     def _returns(self, stamp: _Stamp) -> bool:
@@ -366,7 +377,7 @@ class SteadyClock:
         if self._before_jump is not None and self._returns(first):
             self._intervals_ns.pop()
             begun = [_per_item_ns(self._before_jump, first)]
-        usual_ns = self._usual_ns(min(begun, default=0.0))
+        usual_ns = self._median_ns or min(begun, default=_UNKNOWN_NS)
         elapsed_ns = max(round((first.number - last.number) * usual_ns), 1)
         off_ns = first.stamp_ns - last.stamp_ns - elapsed_ns
         if not _rises(last, first) or self._unnoticed(last, first):
@@ -474,13 +485,13 @@ def _rises(a: _Stamp, b: _Stamp) -> bool:
     return a.stamp_ns < b.stamp_ns
 
 
-def _is_far(a: _Stamp, b: _Stamp, usual_ns: float) -> bool:
+def _is_far(a: _Stamp, b: _Stamp, usual_ns: float, far_ns: int = _FAR_NS) -> bool:
     between_ns = _USUAL_RATIO * usual_ns * (b.number - a.number - 1)
-    return b.stamp_ns - a.stamp_ns > max(_FAR_RATIO * usual_ns, _FAR_NS) + between_ns
+    return b.stamp_ns - a.stamp_ns > max(_FAR_RATIO * usual_ns, far_ns) + between_ns
 
 
-def _follows(a: _Stamp, b: _Stamp, usual_ns: float) -> bool:
-    return _rises(a, b) and not _is_far(a, b, usual_ns)
+def _follows(a: _Stamp, b: _Stamp, usual_ns: float, far_ns: int = _FAR_NS) -> bool:
+    return _rises(a, b) and not _is_far(a, b, usual_ns, far_ns)
 
 
 def _alike(a: _Stamp, b: _Stamp, usual_ns: float) -> bool:

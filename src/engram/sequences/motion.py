@@ -190,7 +190,7 @@ def timed_samples(path: Path) -> tuple[list[Sample], StampReport]:
     """The samples of a file by rising time, and what became of their stamps.
 
     Raises:
-        SequenceError: it is of no known kind, malformed, or empty.
+        SequenceError: it is of no known kind, malformed, or empty, or most of its stamps are wrong.
     """
     clock = SteadyClock(waits=True)
     if path.suffix.lower() == ".csv":
@@ -198,9 +198,13 @@ def timed_samples(path: Path) -> tuple[list[Sample], StampReport]:
         samples = [replace(one.item, stamp_ns=one.time_ns) for one in timed]
     else:
         samples = _pose_samples(path, clock)
+    report = clock.report
     if not samples:
         raise SequenceError(f"{path}: holds no motion")
-    return samples, clock.report
+    if 2 * report.left_out >= report.count:
+        facts = "; ".join(report.texts("sample"))
+        raise SequenceError(f"{path}: its stamps do not increase: {facts}")
+    return samples, report
 
 
 def _pose_samples(path: Path, clock: SteadyClock) -> list[Sample]:

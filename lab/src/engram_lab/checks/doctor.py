@@ -244,14 +244,11 @@ def examined(pairs: Sequence[StereoPair], truth: Sequence[SE3], facts: Facts) ->
     """What the doctor says of a drive."""
     front = Front(Settings())
     front.examination.evidence.facts = facts
-    last_ns: int | None = None
     for pair in pairs:
-        if last_ns is not None and pair.stamp_ns <= last_ns:
-            front.examination.misordered(pair.stamp_ns, last_ns)
-            continue
-        last_ns = pair.stamp_ns
-        front.take(pair)
+        if front.clock.take(pair.stamp_ns):
+            front.take(pair)
     evidence = front.examination.evidence
+    evidence.taken = front.clock.report
     if len(truth) == len(evidence):
         steps = [before.inverse() @ after for before, after in itertools.pairwise(truth)]
         evidence.outside = [None, *steps]

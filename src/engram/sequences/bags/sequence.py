@@ -170,8 +170,10 @@ class BagSequence:
     @property
     def stamp_facts(self) -> list[str]:
         """What was wrong with the stamps of images, motion and fixes, for people."""
-        sides = zip(("left", "right"), self.pairing.clocks, strict=True)
-        reports = {f"{side} image": clock.report for side, clock in sides}
+        left, right = (clock.report for clock in self.pairing.clocks)
+        reports = {"left image": left}
+        if right != left:
+            reports["right image"] = right
         for topic, clock in {**self._motion.clocks, **self._fix_clocks}.items():
             reports[f"message of {topic}"] = clock.report
         named = self._motion.files
