@@ -18,7 +18,7 @@ from engram.localiser.relocalisation import Exhaustive, Suggested
 from engram.robot import RobotOptions, Settings, map_drive, open_drive, open_map, robot_on
 from engram.robot.anchoring import anchor_map
 from engram.robot.fixed import LatestFix
-from engram.sequences.bags.fixes import Fix
+from engram.sequences.bags.fixes import Fix, read_fixes
 
 START_NS = 1_700_000_000_000_000_000
 METRES_PER_DEGREE = 111_320 * float(np.cos(np.deg2rad(50.0)))
@@ -99,6 +99,19 @@ def test_a_live_robot_is_found_by_its_fix(anchored: Path, street: Path, east_m: 
     statuses = [one["status"] for one in script.heard if one["is"] == "seen"]
     assert ("localised" in statuses) == (east_m == 0.0)
     assert [one["ok"] for one in script.heard if one["is"] == "reply"] == [True, False]
+
+
+def test_the_fixes_of_a_wrong_clock_keep_their_order_and_their_times(tmp_path: Path) -> None:
+    second_ns, hour_ns = 10**9, 3600 * 10**9
+    true_ns = [START_NS + number * second_ns for number in range(24)]
+    stamps_ns = [one - hour_ns * (number >= 12) for number, one in enumerate(true_ns)]
+    stamps_ns[5] = 0
+    with bag(tmp_path / "drive", "mcap") as maker:
+        for number, (stamp_ns, received_ns) in enumerate(zip(stamps_ns, true_ns, strict=True)):
+            maker.fix("/gps/fix", stamp_ns, (50.0, 14.0 + number), received_ns=received_ns)
+    found = read_fixes(made(tmp_path / "drive", "mcap"))
+    assert [one.time_ns for one in found] == true_ns[:5] + true_ns[6:]
+    assert [one.longitude_deg - 14.0 for one in found] == [n for n in range(24) if n != 5]
 
 
 @pytest.mark.parametrize("sigmas", [3.0, 0.0])

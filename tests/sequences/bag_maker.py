@@ -130,7 +130,14 @@ class BagMaker:
             types["geometry_msgs/msg/Quaternion"](x, y, z, w),
         )
 
-    def odometry(self, topic: str, stamp_ns: int, forward_m_s: float, turn_rad_s: float) -> None:
+    def odometry(
+        self,
+        topic: str,
+        stamp_ns: int,
+        forward_m_s: float,
+        turn_rad_s: float,
+        received_ns: int | None = None,
+    ) -> None:
         types = self.types
         vector = types["geometry_msgs/msg/Vector3"]
         twist = types["geometry_msgs/msg/Twist"](
@@ -147,7 +154,7 @@ class BagMaker:
             types["geometry_msgs/msg/PoseWithCovariance"](pose, none),
             types["geometry_msgs/msg/TwistWithCovariance"](twist, none),
         )
-        self.write(topic, "nav_msgs/msg/Odometry", message, stamp_ns)
+        self.write(topic, "nav_msgs/msg/Odometry", message, received_ns or stamp_ns)
 
     def twist(self, topic: str, stamp_ns: int, forward_m_s: float, turn_rad_s: float) -> None:
         vector = self.types["geometry_msgs/msg/Vector3"]
@@ -157,7 +164,14 @@ class BagMaker:
         stamped = self.types["geometry_msgs/msg/TwistStamped"](self.header(stamp_ns, "rig"), twist)
         self.write(topic, "geometry_msgs/msg/TwistStamped", stamped, stamp_ns)
 
-    def fix(self, topic: str, stamp_ns: int, place: tuple[float, float], status: int = 0) -> None:
+    def fix(
+        self,
+        topic: str,
+        stamp_ns: int,
+        place: tuple[float, float],
+        status: int = 0,
+        received_ns: int | None = None,
+    ) -> None:
         types = self.types
         message = types["sensor_msgs/msg/NavSatFix"](
             self.header(stamp_ns, "gps"),
@@ -167,7 +181,7 @@ class BagMaker:
             np.diag([0.25, 0.25, 1.0]).ravel(),
             2,
         )
-        self.write(topic, "sensor_msgs/msg/NavSatFix", message, stamp_ns)
+        self.write(topic, "sensor_msgs/msg/NavSatFix", message, received_ns or stamp_ns)
 
     def imu(self, topic: str, stamp_ns: int, rates_rad_s: Iterable[float]) -> None:
         types = self.types

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -49,6 +50,21 @@ def opened(path: Path, **options) -> BagSequence:
     sequence = open_sequence(path, **options)
     assert isinstance(sequence, BagSequence)
     return sequence
+
+
+def stamped(folder: Path, off_ns: Callable[[int, int], int]) -> BagSequence:
+    """A bag of 24 pairs, each of its number in grey, whose stamps are off, by side and number."""
+    folder.mkdir(exist_ok=True)
+    with bag(folder / "b", "mcap") as maker:
+        for side, topic in enumerate((LEFT, RIGHT)):
+            info = topic.replace("image_raw", "camera_info")
+            maker.info(info, START_NS, rectified_infos(camera())[side])
+        for number in range(24):
+            for side, topic in enumerate((LEFT, RIGHT)):
+                image, true_ns = np.full((HEIGHT, WIDTH), number, np.uint8), stamp_ns(number)
+                wrong_ns = true_ns + off_ns(side, number)
+                maker.image(topic, wrong_ns, image, received_ns=true_ns)
+    return opened(made(folder / "b", "mcap"))
 
 
 def assert_whole(sequence: BagSequence) -> None:
@@ -367,6 +383,36 @@ class TestPairs:
         sequence = opened(StereoBag(shuffled, WHOLE.infos).write(tmp_path / "b", "mcap"))
         assert [pair.stamp_ns for pair in sequence] == [stamp_ns(index) for index in (0, 2, 3)]
         assert sequence.stamps.early == 1
+
+    @pytest.mark.parametrize("sides", [(0, 1), (0,), (1,)])
+    @pytest.mark.parametrize("by_s", [-0.5, -3600.0])
+    def test_a_clock_that_is_set_back_costs_no_pair(self, tmp_path, sides, by_s) -> None:
+        drive = stamped(tmp_path, lambda side, n: round(by_s * 10**9) * (side in sides and n >= 12))
+        pairs = list(drive)
+        assert [int(pair.left[0, 0]) for pair in pairs] == list(range(24))
+        assert [int(pair.right[0, 0]) for pair in pairs] == list(range(24))
+        times_ns = np.array([pair.stamp_ns for pair in pairs])
+        np.testing.assert_allclose(np.diff(times_ns), PERIOD_NS)
+        assert "the clock went back" in " ".join(drive.stamp_facts)
+
+    @pytest.mark.parametrize("sides", [(0, 1), (0,), (1,)])
+    @pytest.mark.parametrize("at", [0, 7, 23])
+    def test_a_wrong_stamp_costs_its_own_pair(self, tmp_path, sides, at) -> None:
+        hour_ns = 3600 * 10**9
+        drive = stamped(tmp_path, lambda side, n: hour_ns * (side in sides and n == at))
+        pairs = list(drive)
+        kept = [n for n in range(24) if n != at]
+        assert [int(pair.left[0, 0]) for pair in pairs] == kept
+        assert [int(pair.right[0, 0]) for pair in pairs] == kept
+        assert "1 of 24" in drive.stamp_facts[0]
+
+    def test_a_zero_is_wrong_where_other_stamps_are_not(self, tmp_path) -> None:
+        """In simulation the recorder's clock is another one."""
+        drive = stamped(tmp_path, lambda _, n: -stamp_ns(n) if n == 6 else 12 * 10**9 - START_NS)
+        assert len(list(drive)) == 23
+        assert drive.stamps.early == 1
+        unstamped = stamped(tmp_path / "none", lambda _, n: -stamp_ns(n))
+        assert [pair.stamp_ns for pair in unstamped] == [stamp_ns(n) for n in range(24)]
 
     def test_frames_and_times(self, tmp_path) -> None:
         path = WHOLE.write(tmp_path / "b", "mcap")

@@ -127,8 +127,8 @@ def test_a_step_costs_two_stamps_at_most(how, count, at, gap, by_ns) -> None:
     assert len(lost) <= 2 * steps
     assert all(a < b for a, b in pairwise(found.times_ns.values()))
     assert found.report.left_out == len(lost)
-    # Half a second ahead is what a few lost frames look like.
-    assert found.report.steps or lost or not steps or by_ns[0] in range(2 * S) or at == 0
+    # Ahead may be a pause.
+    assert found.report.steps or lost or by_ns[0] > 0 or at == 0
 
 
 @BOTH

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from engram.errors import SequenceError
 from engram.geometry import SE3
 from engram.sequences import open_sequence
+from engram.sequences.bags.inspecting import describe_bag
 from engram.sequences.motion import FORWARD, read_samples
 
 from .bag_maker import KINDS, LEFT, RIGHT, bag, made, rectified_infos
@@ -58,7 +60,28 @@ def write_poses(path: Path) -> Path:
     return path
 
 
+HOUR_NS = 3600 * 10**9
+# What happens to the clock of the motion alone, at the tenth of its forty samples.
+CLOCKS: dict[str, Callable[[int, int], int]] = {
+    "one zero": lambda number, stamp: 0 if number == 10 else stamp,
+    "one ahead": lambda number, stamp: stamp + HOUR_NS * (number == 10),
+    "set back": lambda number, stamp: stamp - HOUR_NS * (number >= 10),
+    "set back twice": lambda number, stamp: stamp - HOUR_NS * ((number >= 10) + (number >= 20)),
+    "set forwards and back": lambda number, stamp: stamp + HOUR_NS * (10 <= number < 13),
+}
+
+
 class TestFiles:
+    @pytest.mark.parametrize("clock", [name for name in CLOCKS if "forwards" not in name])
+    def test_a_wrong_clock_costs_a_sample_and_is_told(self, tmp_path, clock) -> None:
+        file = tmp_path / "wheels.csv"
+        stamps = [CLOCKS[clock](*one) for one in enumerate(samples())]
+        rows = [f"{stamp},{SPEED_M_S},{TURN_RAD_S}" for stamp in stamps]
+        file.write_text("\n".join(["stamp_ns,forward_m_s,turn_rad_s", *rows]) + "\n")
+        drive = open_sequence(LAYOUTS["folder"].write(tmp_path), motion=[str(file)])
+        assert_moves(drive.motion())
+        assert any(str(file) in fact for fact in drive.stamp_facts)
+
     @pytest.mark.parametrize("write", [write_wheels, write_poses])
     def test_speeds_and_poses_give_the_cameras_motion(self, tmp_path, write) -> None:
         name = "wheels.csv" if write is write_wheels else "wheels.tum"
@@ -140,6 +163,22 @@ class TestTopics:
                 maker.imu("/imu/data", stamp, (0.0, 0.0, TURN_RAD_S + 0.01))
             maker.transform(START_NS, "base_link", "imu_link", SE3.identity())
         return made(tmp_path / "b", request.param)
+
+    @pytest.mark.parametrize("clock", CLOCKS)
+    def test_a_wrong_clock_costs_a_message_and_is_told(self, tmp_path, clock) -> None:
+        with bag(tmp_path / "b", "mcap") as maker:
+            for side, topic in enumerate((LEFT, RIGHT)):
+                info = topic.replace("image_raw", "camera_info")
+                maker.info(info, START_NS, rectified_infos(camera())[side])
+                for index in range(PAIRS):
+                    maker.image(topic, stamp_ns(index), picture(index, side))
+            for number, stamp in enumerate(samples()):
+                wrong = CLOCKS[clock](number, stamp)
+                maker.odometry("/odom", wrong, SPEED_M_S, TURN_RAD_S, received_ns=stamp)
+        drive = open_sequence(made(tmp_path / "b", "mcap"), motion=["/odom"])
+        assert_moves(drive.motion())
+        assert any("/odom" in fact for fact in drive.stamp_facts)
+        assert any("/odom" in fact for fact in describe_bag(tmp_path / "b").stamps)
 
     def test_an_odometry_topic_gives_the_cameras_motion(self, path) -> None:
         drive = open_sequence(path, motion=["/odom"])

@@ -308,8 +308,9 @@ class TestBadStamps:
 
     def test_repeated_stamps(self, drive: Drive) -> None:
         drive.change_stamps(lambda lines: [*lines[:3], lines[2], *lines[4:]])
-        assert len(drive.read()) == PAIRS - 1
-        assert drive.open().stamps.repeated == 1
+        sequence = drive.open(skip_bad=True)  # a layout may name the image beside the stamp
+        assert len(list(sequence)) == PAIRS - 1
+        assert sequence.stamps.repeated == 1
 
     def test_too_many_stamps(self, drive: Drive) -> None:
         def add(lines: list[str]) -> list[str]:

@@ -292,14 +292,13 @@ class SteadyClock:
         return self._placed([one for one in waiting if near(last, one)][:1])
 
     def time_of(self, stamp_ns: int) -> int:
-        """The time of a stamp of the newest stretch that holds it, else of the newest of all."""
-        until_ns: int | None = None
+        """The time of a stamp: in the newest stretch that has it, else as after the newest step."""
+        until_ns = self._time_ns + 1
         for step in reversed(self.steps):
-            time_ns = stamp_ns + step.shift_ns
-            if time_ns >= step.time_ns and (until_ns is None or time_ns < until_ns):
-                return time_ns
+            if step.time_ns <= stamp_ns + step.shift_ns < until_ns:
+                return stamp_ns + step.shift_ns
             until_ns = step.time_ns
-        return stamp_ns if until_ns is None or stamp_ns < until_ns else stamp_ns + self._shift_ns
+        return stamp_ns if stamp_ns < until_ns else stamp_ns + self._shift_ns
 
     def stamp_of(self, time_ns: int) -> int:
         """The stamp that has this time."""

@@ -58,6 +58,8 @@ class _Pairing:
         self._lag_ns = 0
         # Whether a clock was set since the last pair, so that this is not known.
         self._loose = False
+        # Whether there was a pair, so that times of both sides can be compared.
+        self._known = False
         self._last_ns: int | None = None
         self._intervals_ns: deque[int] = deque(maxlen=_NEWEST_INTERVALS)
 
@@ -72,6 +74,8 @@ class _Pairing:
         """Whether a right item is too early for this left one, and so for all that come."""
         self._loose = self._loose or right.step is not None
         if abs(right.stamp_ns - left.stamp_ns) <= self._tolerance_ns:
+            return False
+        if not self._known and right.stamp_ns > left.stamp_ns:
             return False
         return left.time_ns - right.time_ns - self._lag_ns > self._slack_ns
 
@@ -92,7 +96,7 @@ class _Pairing:
         """Takes in a pair."""
         if self._loose or left.stamp_ns != left.time_ns or right.stamp_ns != right.time_ns:
             self._lag_ns = left.time_ns - right.time_ns
-        self._loose = False
+        self._loose, self._known = False, True
 
     @property
     def _slack_ns(self) -> int:
