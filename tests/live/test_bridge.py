@@ -296,6 +296,10 @@ def test_a_late_frame_changes_nothing_and_a_clock_set_back_forgets_the_correctio
     assert belief.map_from_odom is kept
     assert belief.stamp_ns == now_ns
     before = belief.odom_from_base
+    for wrong_ns in (0, now_ns + 10**13):
+        assert not belief.hear({**seen(wrong_ns, 9.0), "left_out": True}, 0.0)
+        assert belief.stamp_ns == now_ns
+    assert belief.map_from_odom is kept
     assert belief.hear(seen(now_ns - 10**10, 1.0), 0.0)
     assert belief.map_from_odom is None
     np.testing.assert_allclose(belief.odom_from_base, before, atol=1e-12)

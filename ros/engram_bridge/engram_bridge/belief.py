@@ -74,6 +74,8 @@ class Belief:
                 self._alive = message
             if message.get("is") != "seen":
                 return False
+            if message.get("left_out"):
+                return False  # its stamp is wrong: nothing must be published with it
             since_ns = None if self.stamp_ns is None else message["stamp_ns"] - self.stamp_ns
             if since_ns is not None and -_LATE_FRAME_NS < since_ns <= 0:
                 return False  # a frame that came late, and was left out

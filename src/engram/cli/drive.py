@@ -215,7 +215,7 @@ def _size(size_bytes: int) -> str:
 
 
 def _drive_facts(path: Path, opening: options.Drive) -> dict[str, Any]:
-    from engram.sequences import ImageSequence
+    from engram.sequences import ImageSequence, stamps_of
 
     sequence = opening.open(path)
     stamps_ns = getattr(sequence, "stamps_ns", None)
@@ -229,7 +229,7 @@ def _drive_facts(path: Path, opening: options.Drive) -> dict[str, Any]:
         **{name: getattr(sequence.camera, name) for name in _CAMERA},
         "notes": list(sequence.cameras.notes) if isinstance(sequence, ImageSequence) else [],
         "stamps": getattr(sequence, "stamp_facts", []),
-        "faulty_share": sequence.stamps.faulty_share if hasattr(sequence, "stamps") else 0.0,
+        "faulty_share": stamps_of(sequence).faulty_share,
         "command": shlex.join(["engram", "map", "MAP.engram", str(path), *opening.typed()]),
     }
 

@@ -62,6 +62,7 @@ def localise_and_print(
     from engram.cli.progress import Bars
     from engram.cli.wording import localised_text, warnings
     from engram.robot import robot_on, summarise
+    from engram.sequences import stamps_of
     from engram.viewing.pictures import PictureWriter
     from engram.viewing.trajectory import write_trajectory
     from engram.viewing.viewer import viewer_for
@@ -93,6 +94,7 @@ def localise_and_print(
     summary = {
         **summarise(results),
         "skipped_pairs": sequence.skipped,
+        "wrong_stamps": stamps_of(sequence).left_out,
         "interrupted": interrupted,
         "findings": robot.diagnosis.to_dict()["findings"],
     }

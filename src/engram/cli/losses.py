@@ -53,7 +53,7 @@ def _noted(sequence: Drive) -> None:
 def _told(sequence: Drive, heading: str) -> bool:
     """Says how images were paired, what was lost and left out; whether it was too much."""
     from engram.doctor import DoctorConfig
-    from engram.sequences import BagSequence, FrameLog
+    from engram.sequences import BagSequence, FrameLog, stamps_of
 
     if isinstance(sequence, BagSequence) and sequence.pairing.left:
         typer.echo(sequence.pairing.text(), err=True)
@@ -64,4 +64,4 @@ def _told(sequence: Drive, heading: str) -> bool:
         return False
     for fact in sequence.stamp_facts:
         typer.echo(f"warning: {fact}", err=True)
-    return bool(lost) or sequence.stamps.faulty_share > DoctorConfig().faulty_share
+    return bool(lost) or stamps_of(sequence).faulty_share > DoctorConfig().faulty_share

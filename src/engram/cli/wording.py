@@ -89,6 +89,8 @@ def _frames(summary: Mapping[str, Any]) -> list[str]:
         fates.append(f"{unusable} of them unusable")
     if skipped := summary["skipped_pairs"]:
         fates.append(f"{counted(skipped, 'bad pair')} skipped")
+    if wrong := summary.get("wrong_stamps", 0):
+        fates.append(f"{wrong} left out for their stamps")
     return [f"  {counted(summary['frames'], 'frame')}: {', '.join(fates)}"]
 
 

@@ -67,6 +67,7 @@ class Step:
         map_from_live: pose in the map frame; None where it is not known.
         proposed: whether the position still rests on a hint that no match has confirmed.
         time_ns: about when it was, ns: its stamp, unless that is wrong or the clock was set back.
+        left_out: whether its stamp is wrong, so that it was not used.
     """
 
     motion: Motion | None = None
@@ -75,6 +76,7 @@ class Step:
     map_from_live: SE3 | None = None
     proposed: bool = False
     time_ns: int = 0
+    left_out: bool = False
 
     @property
     def status(self) -> str:
@@ -172,7 +174,7 @@ class Driving:
         self.trouble = robot.saving.reason if robot.saving.state in _KEEPS_NO_MORE else ""
         clock = front.clock
         trouble = self.trouble or _stamp_trouble(clock, frame.stamp_ns, steps)
-        place = map_from_live, self._proposed, clock.expected_ns
+        place = map_from_live, self._proposed, clock.expected_ns, clock.newest_waits
         return Step(found.motion, found, trouble, *place)
 
     def _only_moved(self, front: Front, arrived: Arrived, motion: OutsideMotion | None) -> Step:
@@ -184,7 +186,8 @@ class Driving:
         else:
             moved = front.left_out(motion)
         trouble = _stamp_trouble(front.clock, stamp_ns, steps) or self.trouble
-        return Step(moved, trouble=trouble, time_ns=front.clock.expected_ns)
+        time_ns = front.clock.expected_ns
+        return Step(moved, trouble=trouble, time_ns=time_ns, left_out=not placed)
 
     def _driven(self, elapsed_ns: int, outside: Outside | None) -> OutsideMotion | None:
         """What wheels and gyroscope measured since the frame before; None if they did not."""
@@ -331,7 +334,7 @@ def _stamp_trouble(clock: SteadyClock, stamp_ns: int, steps: int) -> str:
     """
     if len(clock.steps) > steps:
         return f"{clock.steps[-1].text()}; the drive goes on"
-    if clock.time_ns is None or clock.expected_ns == clock.time_ns:
+    if clock.time_ns is None or not clock.newest_waits:
         return ""
     off_ms = (stamp_ns + clock.shift_ns - clock.time_ns) / 1e6
     return f"a frame is stamped {off_ms:+.0f} ms from the newest good one; left out"

@@ -132,6 +132,7 @@ class LiveProcess:
                 "odom_from_live": _flat(self._track.odom_from_live.matrix()),
                 "odom_covariance": _flat(self._track.covariance),
                 "ms": 1e3 * (time.perf_counter() - event.arrived_s),
+                **({"left_out": True} if step.left_out else {}),
                 **_found(step),
                 **self._placed(step),
             }

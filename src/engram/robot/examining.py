@@ -15,7 +15,14 @@ from engram.odometry import MotionSource, OutsideMotion
 from engram.robot.front import Arrived, Front, arriving, stamp_of
 from engram.robot.session import DriveSequence
 from engram.robot.settings import RobotOptions, Settings
-from engram.sequences import Drive, FrameLog, ImageSequence, LoggedFrame, SequenceInfo
+from engram.sequences import (
+    Drive,
+    FrameLog,
+    ImageSequence,
+    LoggedFrame,
+    SequenceInfo,
+    stamps_of,
+)
 from engram.sequences.motion import MovedSequence
 
 # A long drive is examined in so many stretches, as it may begin at rest or in the dark.
@@ -65,8 +72,7 @@ def examine_drive(
             watched.advance("examined")
             watched.check()
     evidence.bad += sequence.skipped_reasons
-    if not isinstance(sequence, FrameLog):
-        evidence.read = sequence.stamps
+    evidence.read = stamps_of(sequence)
     return front.diagnosis
 
 

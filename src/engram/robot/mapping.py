@@ -26,7 +26,7 @@ from engram.robot.saving import SavedDrive, configuration_of, node_words
 from engram.robot.session import DriveSequence, session_of_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.spool import commit_spools
-from engram.sequences import FrameLog
+from engram.sequences import FrameLog, stamps_of
 
 
 @dataclass(slots=True)
@@ -40,6 +40,7 @@ class MapReport:
         resumed: whether the run continued an earlier one.
         interrupted: whether the run was stopped; its progress is saved and can be resumed.
         skipped: pairs left out under `skip_bad`.
+        wrong_stamps: pairs left out for their stamp.
         diagnosis: what the doctor found in the first frames; None if nothing was done.
         results: one per live frame.
     """
@@ -50,6 +51,7 @@ class MapReport:
     resumed: bool = False
     interrupted: bool = False
     skipped: int = 0
+    wrong_stamps: int = 0
     diagnosis: Diagnosis | None = None
     results: list[Localisation] = field(default_factory=list, repr=False)
 
@@ -69,6 +71,7 @@ class MapReport:
             "interrupted": self.interrupted,
             "nodes_saved": self.saved,
             "skipped_pairs": self.skipped,
+            "wrong_stamps": self.wrong_stamps,
             "findings": [] if self.diagnosis is None else self.diagnosis.to_dict()["findings"],
             **summarise(self.results),
         }
@@ -146,6 +149,7 @@ def map_drive(
         into = _written(map_path) if opened is None else nullcontext(opened)
         _Mapping(into, sequence, settings, options, begin, report).run(monitor)
     report.skipped = sequence.skipped
+    report.wrong_stamps = stamps_of(sequence).left_out
     return report
 
 

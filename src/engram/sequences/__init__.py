@@ -3,7 +3,7 @@
 from engram.sequences.bags import BagSequence
 from engram.sequences.framelog import FrameLog, FrameLogHeader, FrameLogWriter
 from engram.sequences.image_sequence import ImageSequence
-from engram.sequences.opening import SEQUENCES, Drive, open_sequence
+from engram.sequences.opening import SEQUENCES, Drive, open_sequence, stamps_of
 from engram.sequences.options import FrameRange, TimeRange
 from engram.sequences.sequence import (
     FrameSequence,
@@ -33,4 +33,5 @@ __all__ = [
     "first_pair_hash",
     "open_sequence",
     "session_of",
+    "stamps_of",
 ]

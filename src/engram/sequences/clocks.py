@@ -231,6 +231,11 @@ class SteadyClock:
         return self._shift_ns
 
     @property
+    def newest_waits(self) -> bool:
+        """Whether the newest stamp has no place; live, its item is left out."""
+        return bool(self._waiting)
+
+    @property
     def expected_ns(self) -> int:
         """About the time of the newest stamp, with a place or without, ns; 0 before the first."""
         if self._last is None:

@@ -13,6 +13,7 @@ from typing import Any, TypeAlias, TypedDict, Unpack
 
 from engram.errors import ConfigError, SequenceError
 from engram.sequences.bags import BagSequence, is_bag, open_bag
+from engram.sequences.clocks import StampReport
 from engram.sequences.euroc import find_euroc, find_tumvi, is_euroc, is_tumvi
 from engram.sequences.folder import TEMPLATE, find_folder, is_folder
 from engram.sequences.framelog import FrameLog, is_framelog, open_framelog
@@ -46,6 +47,15 @@ _RECORDINGS = {
     ".svo": "ZED: export its images with the ZED SDK into left/ and right/, or record a bag",
     ".svo2": "ZED: export its images with the ZED SDK into left/ and right/, or record a bag",
 }
+
+
+def stamps_of(sequence: object) -> StampReport:
+    """What became of the stamps of a drive; a frame log has times."""
+    if isinstance(sequence, ImageSequence | BagSequence):
+        return sequence.stamps
+    return StampReport()
+
+
 # Most drives listed if a parent folder is given.
 _MOST_NAMED = 10
 
