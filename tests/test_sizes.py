@@ -6,7 +6,7 @@ from pathlib import Path
 
 import engram
 
-_LONG, _TOO_LONG, _MOST_LONG = 400, 600, 12
+_LONG, _TOO_LONG, _MOST_LONG = 400, 700, 16
 
 
 def test_files_of_the_package_stay_short() -> None:
