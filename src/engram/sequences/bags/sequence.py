@@ -82,15 +82,12 @@ class BagSequence:
         self._options = options
         self._bag = Bag(path)
         self._decoder = Decoder(self._bag.is_ros1)
+        self._stamps: dict[str, Stamps] = {}
         given = None if options.calibration is None else self._given(options)
         self.topics = self._stereo_topics(given)
         if given is not None and self.topics.are_rectified and given.rectification is not None:
             given = self._given(options, rectified=True)
         self._reasons: dict[str, list[str]] = {}
-        self._stamps = {
-            topic: Stamps(self._bag, self._decoder, topic)
-            for topic in (self.topics.left, self.topics.right)
-        }
         tolerance_ns, self._first_ns = self._learn()
         self.pairing = Pairing(tolerance_ns)
         self._static = read_transforms(self._bag, self._decoder)
@@ -279,8 +276,10 @@ class BagSequence:
             topic: the topic.
             damaged: called with why an image cannot be read.
         """
-        kind, stamps = self._bag.topics[topic].type, self._stamps.get(topic)
-        stamps = stamps or Stamps(self._bag, self._decoder, topic)
+        kind = self._bag.topics[topic].type
+        if topic not in self._stamps:
+            self._stamps[topic] = Stamps(self._bag, self._decoder, topic)
+        stamps = self._stamps[topic]
         for number, record in enumerate(self._bag.records({topic})):
             try:
                 message = self._decoder.message(record, kind)
