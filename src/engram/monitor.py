@@ -37,6 +37,41 @@ class Monitor:
 QUIET = Monitor()
 
 
+class Relay(Monitor):
+    """Another monitor, which receives every report; the work may be stopped here, too.
+
+    Whatever wraps a monitor is one of these, or derives from it: a wrapper that passes reports on
+    by hand drops, without a word, those that it does not know of.
+
+    Args:
+        inner: receives every report, those of stages too.
+        also: called by `check` after that of `inner`; raises KeyboardInterrupt to stop the work.
+    """
+
+    def __init__(self, inner: Monitor, also: Callable[[], None] = lambda: None) -> None:
+        self._inner = inner
+        self._also = also
+
+    @contextmanager
+    def stage(self, what: str, total: int) -> Iterator[Monitor]:
+        """See `Monitor`."""
+        with self._inner.stage(what, total) as part:
+            yield Relay(part, self._also)
+
+    def advance(self, word: str = "") -> None:
+        """See `Monitor`."""
+        self._inner.advance(word)
+
+    def hear(self, report: Any) -> None:
+        """See `Monitor`."""
+        self._inner.hear(report)
+
+    def check(self) -> None:
+        """See `Monitor`."""
+        self._inner.check()
+        self._also()
+
+
 class Advancing(Monitor):
     """Calls a function with the status of each finished item."""
 
@@ -87,28 +122,7 @@ def deferred_interrupt() -> Iterator[Callable[[], None]]:
 def interruptible(monitor: Monitor) -> Iterator[Monitor]:
     """The same monitor, whose `check` also raises after Ctrl-C; see `deferred_interrupt`."""
     with deferred_interrupt() as raise_if_asked:
-        yield _Interruptible(monitor, raise_if_asked)
-
-
-class _Interruptible(Monitor):
-    def __init__(self, monitor: Monitor, raise_if_asked: Callable[[], None]) -> None:
-        self._monitor = monitor
-        self._raise_if_asked = raise_if_asked
-
-    def advance(self, word: str = "") -> None:
-        self._monitor.advance(word)
-
-    def hear(self, report: Any) -> None:
-        self._monitor.hear(report)
-
-    @contextmanager
-    def stage(self, what: str, total: int) -> Iterator[Monitor]:
-        with self._monitor.stage(what, total) as part:
-            yield _Interruptible(part, self._raise_if_asked)
-
-    def check(self) -> None:
-        self._raise_if_asked()
-        self._monitor.check()
+        yield Relay(monitor, raise_if_asked)
 
 
 @contextmanager

@@ -7,8 +7,10 @@ import os
 import random
 import shutil
 import signal
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -16,15 +18,18 @@ from sqlalchemy import Engine, event
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
+from engram.centre.worker import watching
 from engram.errors import ConfigError, InputError
+from engram.fleet.build.orders import JudgeOptions
 from engram.fleet.dream import DreamOptions, dream, hand_ins_of, keep_hand_in
 from engram.fleet.dream.dreaming import BEHAVIOURS
 from engram.fleet.dream.judging import gain
+from engram.fleet.dream.trying import Try, try_all
 from engram.graph.model import Clock
 from engram.maps import Map, check_file
 from engram.measures import Drive
 from engram.monitor import Monitor
-from engram.robot import RobotOptions
+from engram.robot import RobotOptions, Settings
 from engram.sequences import FrameLogHeader, FrameLogWriter, SequenceInfo
 
 from .robots import DAY_NS, OPTIONS, merged
@@ -227,6 +232,46 @@ def test_a_time_budget_ends_the_trying_and_the_best_so_far_counts(town, tmp_path
     assert report.tried == {}
     assert "the same command tries more" in report.text()
     assert dream(centre, robots, drives, options=ASKED).tried.keys() == BEHAVIOURS.keys()
+
+
+def orders_tried(robots: list[Path], drives: list[Path], folder: Path) -> Try:
+    judge = JudgeOptions(drives, judge_at_m=3.0, localising=ASKED.localising)
+    return Try(folder, robots, judge, Settings(), ASKED.merging, None)
+
+
+@pytest.mark.parametrize("end_s", [None, 4e9])
+def test_whoever_watches_a_dream_learns_how_much_there_is_to_try(
+    town, tmp_path, monkeypatch, end_s
+):
+    monkeypatch.setattr(watching, "_TELL_S", 0.0)
+    told: list[str] = []
+    monitor = watching.Watching(lambda progress: bool(told.append(progress)))
+    asked = replace(orders_tried(town[1], town[2], tmp_path / "results"), end_s=end_s)
+    assert try_all({"usual": asked}, 1, None, monitor)
+    assert told[-1] == "try orders: 1 of 2"
+    monitor.check()
+    assert told[-1] == "try orders: 2 of 2"
+
+
+@pytest.mark.long
+def test_beside_each_other_dreams_have_one_bar(town, tmp_path):
+    class Heard(Monitor):
+        stages: ClassVar[list[tuple[str, int]]] = []
+        words: ClassVar[list[str]] = []
+
+        def stage(self, what: str, total: int) -> AbstractContextManager[Monitor]:
+            self.stages.append((what, total))
+            return nullcontext(self)
+
+        def advance(self, word: str = "") -> None:
+            self.words.append(word)
+
+    asked = {
+        name: orders_tried(town[1], town[2], tmp_path / name) for name in ("usual", "once more")
+    }
+    assert try_all(asked, 2, None, Heard())
+    assert Heard.stages == [("try orders", 4)]
+    assert len(Heard.words) == 4
 
 
 def test_hand_ins_are_kept_once_in_the_order_in_which_they_came(town, tmp_path):

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from engram.monitor import Monitor
+from engram.monitor import Monitor, Relay
 
 
-class Stages(Monitor):
+class Stages(Relay):
     """Tells each stage as it begins, and how long it took when it ends.
 
     Args:
@@ -21,7 +21,7 @@ class Stages(Monitor):
     """
 
     def __init__(self, inner: Monitor, tell: Callable[[str], object]) -> None:
-        self._inner = inner
+        super().__init__(inner)
         self._tell = tell
         self.took: dict[str, float] = {}
 
@@ -30,7 +30,7 @@ class Stages(Monitor):
         """See `Monitor`."""
         self._tell(f"{what} …")
         begun_s = time.monotonic()
-        with self._inner.stage(what, total) as part:
+        with super().stage(what, total) as part:
             yield part
         self.took[what] = time.monotonic() - begun_s
         self._tell(f"{what}: {self.took[what]:.1f} s")

@@ -13,7 +13,7 @@ from engram.fleet.build.cluster import run_on_cluster
 from engram.fleet.build.orders import JudgeOptions
 from engram.fleet.merge.settings import MergeOptions
 from engram.maps import copy_map
-from engram.monitor import Monitor, write_whole
+from engram.monitor import Monitor, Relay, write_whole
 from engram.processes import run_in_processes
 from engram.robot import Settings
 
@@ -36,19 +36,19 @@ class Try:
     merging: MergeOptions
     end_s: float | None
 
+    def count(self) -> int:
+        """Number of orders."""
+        return self.judge.orders.of(len(self.handed))
 
-class _Deadline(Monitor):
-    """Stops work at a time."""
 
-    def __init__(self, monitor: Monitor, end_s: float | None) -> None:
-        self._monitor, self._end_s = monitor, end_s
+class _Deadline:
+    """Stops work at a time, `time.time`; `over` says that it did."""
+
+    def __init__(self, end_s: float | None) -> None:
+        self._end_s = end_s
         self.over = False
 
-    def advance(self, word: str = "") -> None:
-        self._monitor.advance(word)
-
     def check(self) -> None:
-        self._monitor.check()
         if self._end_s is not None and time.time() >= self._end_s:
             self.over = True
             raise KeyboardInterrupt
@@ -60,11 +60,12 @@ def try_orders(asked: Try, monitor: Monitor) -> bool:
     Raises:
         KeyboardInterrupt: the monitor stopped it, rather than the time.
     """
-    deadline = _Deadline(monitor, asked.end_s)
+    deadline = _Deadline(asked.end_s)
+    watched = Relay(monitor, deadline.check)
     try:
-        deadline.check()
+        watched.check()
         find_best_order(
-            asked.handed, asked.place, asked.settings, asked.merging, asked.judge, deadline
+            asked.handed, asked.place, asked.settings, asked.merging, asked.judge, watched
         )
     except KeyboardInterrupt:
         if not deadline.over:
@@ -88,13 +89,16 @@ def try_all(
         KeyboardInterrupt: the monitor stopped it.
         WorkerError: workers died repeatedly, or the scheduler cannot be reached.
     """
+    if scheduler is None and workers == 1:
+        return all(try_orders(one, monitor) for one in asked.values())
     ended: list[bool] = []
-    if scheduler is not None:
-        _on_cluster(asked, scheduler, monitor, ended.append)
-    elif workers > 1:
-        run_in_processes(try_orders, asked, workers, monitor, lambda _, end, __: ended.append(end))
-    else:
-        ended += [try_orders(one, monitor) for one in asked.values()]
+    with monitor.stage("try orders", sum(one.count() for one in asked.values())) as stage:
+        if scheduler is not None:
+            _on_cluster(asked, scheduler, stage, ended.append)
+        else:
+            run_in_processes(
+                try_orders, asked, workers, stage, lambda _, end, __: ended.append(end)
+            )
     return all(ended)
 
 
