@@ -91,7 +91,7 @@ class Site:
         return Agent(self.folder / name, client=self.link, chance=lambda: 0.0)
 
     def work(self) -> int:
-        return work_off(self.centre)
+        return work_off(self.centre, merging.merge_hand_in)
 
     def settle(self) -> None:
         """Until nobody has anything to do."""

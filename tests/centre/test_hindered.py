@@ -67,7 +67,7 @@ def test_a_map_that_is_hindered_hinders_no_other(site, monkeypatch):
             raise merging.WaitsError("its disk is full")
         merged.append(row["map"])
 
-    monkeypatch.setattr(loop, "merge_hand_in", of_one)
+    monkeypatch.setattr(merging, "merge_hand_in", of_one)
     site.centre.add_map("town", "tests", POLICY)
     monkeypatch.setattr(HandIns, "waiting", lambda _, name: [{"map": name}])
     with pytest.raises(merging.WaitsError):
@@ -135,6 +135,7 @@ def test_a_worker_goes_on_after_what_hindered_it_and_tells_it(site, monkeypatch,
         monkeypatch.undo()
 
     monkeypatch.setattr(merging, "admit", lambda *_: full())
+    monkeypatch.setattr(loop.work_off, "__defaults__", (merging.merge_hand_in,))
     loop.work(site.centre, wait, lambda: len(waits) == 1)
     assert waits == [loop._AGAIN_S]
     assert f"hand-in {row['id'][:8]} waits: no space is left; tried again in" in caplog.text

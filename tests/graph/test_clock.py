@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import ConfigError
-from engram.graph.clock import check_longitude, check_zone, hour_of_day
+from engram.graph.clock import check_longitude, check_zone, hour_of_day, zone_note
 from engram.graph.model import Clock
 from engram.sequences import SequenceInfo
 
@@ -71,3 +71,23 @@ def test_what_is_no_longitude_is_refused(longitude_deg: float) -> None:
 def test_what_is_no_zone_is_refused(zone: str) -> None:
     with pytest.raises(ConfigError, match="zone"):
         check_zone(zone)
+
+
+STRANGE = ["Mars/Olympus_Mons", "../../etc/passwd", "", "x" * 10_000, "Europe", "zone.tab", "a\0b"]
+
+
+@pytest.mark.parametrize("zone", STRANGE)
+def test_in_a_zone_that_this_machine_does_not_know_no_hour_is_known(zone: str) -> None:
+    source = info(zone=zone)
+    assert hour_of_day(source, at(2011, 7, 1, 12)) is None
+    assert "is unknown to this machine: update its time zone database" in zone_note(source)
+    with pytest.raises(ConfigError) as told:
+        check_zone(zone)
+    assert len(str(told.value)) < 150
+
+
+def test_where_the_longitude_says_the_hour_the_zone_is_not_asked() -> None:
+    source = info(15.0, "Mars/Olympus_Mons")
+    assert hour_of_day(source, at(2011, 7, 1, 12)) == pytest.approx(13.0, abs=1e-6)
+    assert zone_note(source) == ""
+    assert zone_note(info(zone="Europe/Berlin")) == ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Iterator
 from typing import Any, TypedDict, get_type_hints
 
@@ -27,6 +28,7 @@ from engram.transfers import Manifest, PartHash, split
 from engram.transfers.join import blobs_named
 from engram.transfers.manifest import decode_manifest, encode_manifest
 
+_log = logging.getLogger(__name__)
 _OPTIONS = TypedDict("_OPTIONS", get_type_hints(DownloadOptions), total=False)  # type: ignore[misc]
 
 
@@ -159,6 +161,9 @@ class Downloads:
             raise
         except EngramError as error:
             change = {"state": FAILED, "error": self._centre.words_of(error)}
+        except Exception as error:  # of what a stranger handed in: it ends this download alone
+            _log.exception("%s: download %s", row["map"], row["id"])
+            change = {"state": FAILED, "error": self._centre.fault_of(error)}
         with self._centre.database.writing() as connection:
             connection.execute(
                 update(artifacts).where(artifacts.c.id == row["id"]).values(**change)

@@ -30,6 +30,7 @@ from engram.fleet.merge import NO_RELOCALISER, MergeOptions
 from engram.maps import Map
 
 _HOUR_NS = DAY_NS // 24
+_SHOWN_CHARACTERS = 300
 _NAME = re.compile(r"[a-z][a-z0-9-]{0,39}")
 
 
@@ -111,6 +112,10 @@ class Centre:
     def words_of(self, error: Exception) -> str:
         """What an error says, for robots and people: not where on its machine the centre lies."""
         return str(error).replace(f"{self.folder}{os.sep}", "")
+
+    def fault_of(self, error: Exception) -> str:
+        """Kind and first words of an error that nobody raised on purpose."""
+        return f"{type(error).__name__}: {self.words_of(error)}"[:_SHOWN_CHARACTERS]
 
     def packs(self, name: str) -> Packs:
         """The parts of a map."""

@@ -73,6 +73,8 @@ def info(
             f"{one['session']}  {one['robot']:12s}  {one['start']}  {hour}  "
             f"{counted(one['nodes'], 'node')}"
         )
+    for note in {one["note"]: None for one in listed.get("session_list", []) if one["note"]}:
+        typer.echo(f"note: {note}", err=True)
     for one in listed.get("node_list", []):
         typer.echo(f"{one['node']}  session {one['session'][:8]}  {one['driven_m']:8.1f} m")
 

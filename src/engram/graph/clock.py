@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import Protocol
 from zoneinfo import ZoneInfo
 
@@ -12,6 +14,9 @@ from engram.graph.model import Clock, Session
 
 _NS_PER_HOUR = 3_600_000_000_000
 _HOURS_PER_DAY = 24
+# What the IANA database may ever call a zone; the longest name today has 32 characters.
+_ZONE = re.compile(r"(?=.{1,64}\Z)[A-Za-z0-9_+-]+(/[A-Za-z0-9_+-]+)*")
+_SHOWN_CHARACTERS = 40
 
 
 class Clocked(Protocol):
@@ -37,7 +42,8 @@ def hour_of_day(source: Clocked, stamp_ns: int) -> float | None:
     """Hour of day in [0, 24) at a stamp; None if unknown.
 
     Mean solar time (UTC + longitude / 15) if a longitude is known, else civil time of the zone.
-    None for a clock that is not UTC, and without longitude and zone.
+    None for a clock that is not UTC, and without longitude and a zone that this machine knows:
+    drives come from machines with a newer database.
 
     Source: method §2.8.
     """
@@ -46,10 +52,10 @@ def hour_of_day(source: Clocked, stamp_ns: int) -> float | None:
     stamp_ns += _shift_ns(source)
     if source.longitude_deg is not None:
         hour = stamp_ns / _NS_PER_HOUR + source.longitude_deg / 15
-    elif source.zone is not None:
+    elif (zone := known_zone(source.zone)) is not None:
         # Zones' offsets are whole seconds; the nanoseconds are added afterwards.
         seconds, nanos = divmod(stamp_ns, 1_000_000_000)
-        offset = datetime.fromtimestamp(seconds, UTC).astimezone(ZoneInfo(source.zone)).utcoffset()
+        offset = datetime.fromtimestamp(seconds, UTC).astimezone(zone).utcoffset()
         if offset is None:
             return None
         hour = (seconds + offset.total_seconds()) / 3600 + nanos / _NS_PER_HOUR
@@ -83,17 +89,41 @@ def check_longitude(longitude_deg: float | None) -> None:
         raise ConfigError(f"longitude is {longitude_deg}, must be in [-180, 180] degrees east")
 
 
+@lru_cache
+def known_zone(zone: str | None) -> ZoneInfo | None:
+    """The time zone of a name; None for None, and for one that this machine does not know."""
+    if zone is None or not is_zone_name(zone):
+        return None
+    try:
+        return ZoneInfo(zone)
+    except (KeyError, ValueError, OSError):  # not found; malformed; a folder of the database
+        return None
+
+
+def is_zone_name(text: str) -> bool:
+    """Whether a text may name a zone of the IANA database, known to this machine or not."""
+    return _ZONE.fullmatch(text) is not None
+
+
+def zone_note(source: Clocked) -> str:
+    """Why hours are unknown though a zone is given; empty where that is not so."""
+    unplaced = source.clock is Clock.UTC and source.longitude_deg is None
+    if not unplaced or source.zone is None or known_zone(source.zone) is not None:
+        return ""
+    return (
+        f"time zone {source.zone!r} is unknown to this machine: update its time zone database, or "
+        "correct the zone with engram amend"
+    )
+
+
 def check_zone(zone: str | None) -> None:
     """Refuse a name that is not a time zone of the IANA database.
 
     Raises:
         ConfigError: the zone is unknown on this machine.
     """
-    if zone is None:
-        return
-    try:
-        ZoneInfo(zone)
-    except (KeyError, ValueError, OSError):  # not found; malformed; a folder of the database
+    if zone is not None and known_zone(zone) is None:
         raise ConfigError(
-            f"time zone {zone!r} is unknown; give an IANA name such as Europe/Berlin"
-        ) from None
+            f"time zone {zone!r:.{_SHOWN_CHARACTERS}} is unknown; give an IANA name such as "
+            "Europe/Berlin"
+        )

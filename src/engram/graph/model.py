@@ -68,6 +68,10 @@ class Session:
         return self.recorded or self
 
 
+# Characters of a robot's name: a line of any screen shows it, and every session carries it.
+LONGEST_NAME = 200
+
+
 class Amendable(StrEnum):
     """Fields of a session that may be corrected later."""
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from engram.errors import InputError
 from engram.graph.clock import check_zone
-from engram.graph.model import Amendable, Amendment, Session
+from engram.graph.model import LONGEST_NAME, Amendable, Amendment, Session
 from engram.maps.rows import START, checked_text
 
 
@@ -24,8 +24,12 @@ def checked_amendments(
         checked_text(value, what)
         if what is Amendable.ZONE:
             check_zone(value)
-        if not value or (what is Amendable.START and not START.fullmatch(value)):
-            raise InputError(f"{value!r} is not valid as the {what} of a session")
+        if (
+            not value
+            or (what is Amendable.ROBOT and len(value) > LONGEST_NAME)
+            or (what is Amendable.START and not START.fullmatch(value))
+        ):
+            raise InputError(f"{value!r:.60} is not valid as the {what} of a session")
         amendment = Amendment(shown.id, what, value, now_ns)
         if amendment.applied(shown) != shown:
             found[what] = amendment

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from engram.counts import counted
-from engram.graph.clock import hour_of_day
+from engram.graph.clock import hour_of_day, zone_note
 from engram.graph.model import Clock, Session
 from engram.maps.difference import MapDifference, difference, hours_of_nodes
 from engram.maps.hiding import Reverted
@@ -197,6 +197,7 @@ def blame_node(path: Path, prefix: str) -> dict[str, Any]:
         "when": stamp_text(session, origin.stamp_ns),
         "stamp_ns": origin.stamp_ns,
         "hour": None if session is None else hour_of_day(session, origin.stamp_ns),
+        "note": "" if session is None else zone_note(session),
         "driven_m": origin.driven_m,
         "revision": origin.brought,
         "author": brought.author,
@@ -285,6 +286,7 @@ def sessions_of(contents: MapContents) -> list[dict[str, Any]]:
             "robot": session.robot,
             "start": stamp_text(session, session.start_ns),
             "hour": hour_of_day(session, session.start_ns),
+            "note": zone_note(session),
             "nodes": nodes[session.id],
         }
         for session in contents.sessions

@@ -19,7 +19,9 @@ from sqlalchemy import Table
 
 from engram.errors import CalibrationError, InputError, MapCorruptError
 from engram.geometry import SE3, CameraId, StereoCamera
+from engram.graph.clock import is_zone_name
 from engram.graph.model import (
+    LONGEST_NAME,
     Amendable,
     Amendment,
     Clock,
@@ -254,20 +256,60 @@ def session_from_row(row: Row, camera: CameraId) -> Session:
     """The session."""
     return Session(
         id=SessionId(uuid_from_bytes(row["uuid"], f"session {row['key']}")),
-        robot=row["robot"],
+        robot=_robot_name(row["robot"]),
         camera=camera,
         start_ns=row["start_ns"],
         clock=member(Clock, row["clock"], "sessions"),
-        longitude_deg=row["longitude_deg"],
-        zone=row["zone"],
+        longitude_deg=_longitude(row["longitude_deg"]),
+        zone=None if row["zone"] is None else _zone_name(row["zone"]),
     )
+
+
+def _robot_name(text: str) -> str:
+    """The name of a robot.
+
+    Raises:
+        MapCorruptError: it is none that Engram stores.
+    """
+    if not 0 < len(text) <= LONGEST_NAME:
+        raise MapCorruptError(
+            f"table sessions: a robot's name has {len(text)} characters, must have 1 to "
+            f"{LONGEST_NAME}"
+        )
+    return text
+
+
+def _longitude(longitude_deg: float | None) -> float | None:
+    """Degrees east.
+
+    Raises:
+        MapCorruptError: no place has it.
+    """
+    if longitude_deg is not None and not -180 <= longitude_deg <= 180:
+        raise MapCorruptError(f"table sessions: the longitude is {longitude_deg} degrees")
+    return longitude_deg
+
+
+def _zone_name(text: str) -> str:
+    """The name of a time zone, which a newer database than this machine's may know.
+
+    Raises:
+        MapCorruptError: it can name none.
+    """
+    if not is_zone_name(text):
+        raise MapCorruptError(f"table sessions: {text!r:.60} is not the name of a time zone")
+    return text
 
 
 def amendment_from_row(row: Row, session: SessionId) -> Amendment:
     """The amendment of this session."""
     what = member(Amendable, row["what"], "amendments")
     if what is Amendable.START and not START.fullmatch(row["value"]):
-        raise MapCorruptError(f"amendment of session {session}: {row['value']!r} is not a time")
+        raise MapCorruptError(f"amendment of session {session}: {row['value']!r:.60} is not a time")
+    if what is Amendable.ZONE:
+        _zone_name(row["value"])
+    if what is Amendable.ROBOT:
+        _robot_name(row["value"])
     return Amendment(session, what, row["value"], row["amended_ns"])
 
 

@@ -7,8 +7,9 @@ import json
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 import safetensors
 import safetensors.numpy
@@ -130,9 +131,20 @@ def hash_of(vocabulary: Vocabulary) -> bytes:
     return vocabulary_hash(encode_vocabulary(vocabulary))
 
 
+class _About(msgspec.Struct):
+    """What a vocabulary says of itself, beside its arrays."""
+
+    format: int
+    descriptor: str
+    images: Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
+    beam: Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
+    trained_on: str
+
+
 # What malformed headers raise; of nested ones JSON raises the last.
 _MALFORMED = (
     safetensors.SafetensorError,
+    msgspec.MsgspecError,
     InputError,
     ValueError,
     LookupError,
@@ -175,13 +187,13 @@ def default_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
     return Vocabulary(descriptor, tree, WordStatistics(2, one, none - 1, none), (), trained_on="–")
 
 
-def _metadata(body: bytes) -> dict[str, Any]:
+def _metadata(body: bytes) -> _About:
     length = int.from_bytes(body[:8], "little")
     header = json.loads(body[8 : 8 + length])
-    about = json.loads(header["__metadata__"][_METADATA_KEY])
-    if about["format"] != VOCABULARY_FORMAT:
-        raise ValueError(f"its format is {about['format']}, must be {VOCABULARY_FORMAT}")
-    return dict(about)
+    about = msgspec.json.decode(header["__metadata__"][_METADATA_KEY], type=_About)
+    if about.format != VOCABULARY_FORMAT:
+        raise ValueError(f"its format is {about.format}, must be {VOCABULARY_FORMAT}")
+    return about
 
 
 def _checked_arrays(tensors: Any) -> dict[str, NDArray[Any]]:
@@ -197,9 +209,9 @@ def _checked_arrays(tensors: Any) -> dict[str, NDArray[Any]]:
     return found
 
 
-def _assembled(about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Vocabulary:
+def _assembled(about: _About, arrays: dict[str, NDArray[Any]]) -> Vocabulary:
     statistics = WordStatistics(
-        int(about["images"]), arrays["seen"], arrays["parents"], arrays["seen_with_parent"]
+        about.images, arrays["seen"], arrays["parents"], arrays["seen_with_parent"]
     )
     _check_statistics(statistics)
     lengths, words = arrays["sample_lengths"], arrays["sample_words"].astype(np.int32)
@@ -211,7 +223,7 @@ def _assembled(about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Vocabu
             raise ValueError("a sample shows an unknown word")
         if (np.diff(sample) <= 0).any():
             raise ValueError("the words of a sample do not increase")
-    kind = feature_kind(about["descriptor"])
+    kind = feature_kind(about.descriptor)
     if arrays["centres"].shape[1] != kind.descriptor_bytes:
         raise ValueError(
             f"its words have {arrays['centres'].shape[1]} bytes, descriptors of kind {kind.name} "
@@ -222,8 +234,8 @@ def _assembled(about: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Vocabu
         TreeArrays(arrays["centres"], arrays["bounds"]),
         statistics,
         samples,
-        int(about["beam"]),
-        str(about["trained_on"]),
+        about.beam,
+        about.trained_on,
     )
     if vocabulary.tree.words != len(statistics):
         raise ValueError("its tree and its statistics have different numbers of words")

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.errors import MapCorruptError
+from engram.errors import EngramError, IncompatibleError, MapCorruptError
 from engram.frontend import DescriptorKind, Frame
 from engram.graph.model import LandmarkSource, NodeId
-from engram.maps import Map
+from engram.maps import Map, check_file
+from engram.maps.records import Problem
 from engram.monitor import QUIET, Monitor
 from engram.places.bag_of_words import inverse_frequencies
 from engram.places.vocabulary import Vocabulary, decode_vocabulary, default_vocabulary, hash_of
@@ -29,6 +31,37 @@ def vocabulary_of(opened: Map) -> Vocabulary | None:
         MapCorruptError: it is damaged.
     """
     return None if opened.vocabulary is None else decode_vocabulary(opened.vocabulary)
+
+
+def problems_of(path: Path, *, thin: bool = False) -> list[Problem]:
+    """What is wrong with a map file, its vocabulary included.
+
+    Args:
+        path: NAME.engram.
+        thin: see `check_file`.
+
+    Raises:
+        NotAMapError: the file does not exist or is not a map.
+        FormatVersionError: a newer Engram wrote it.
+    """
+    return [*check_file(path, thin=thin).problems, *vocabulary_problems(path)]
+
+
+def vocabulary_problems(path: Path) -> list[Problem]:
+    """What is wrong with a map's vocabulary; nothing where the map itself cannot be opened."""
+    try:
+        with Map.open(path) as store:
+            body = store.vocabulary
+    except EngramError:
+        return []
+    try:
+        if body is not None:
+            decode_vocabulary(body)
+    except MapCorruptError as error:
+        return [Problem("vocabularies", "", str(error))]
+    except IncompatibleError:  # of a package that is not installed here
+        return []
+    return []
 
 
 def vocabulary_or_default(opened: Map, descriptor: DescriptorKind) -> Vocabulary:

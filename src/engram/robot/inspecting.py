@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from engram.graph.clock import hour_of_day
+from engram.graph.clock import hour_of_day, zone_note
 from engram.graph.model import Amendable, path_id
 from engram.maps import Map, check_file
 from engram.maps.history import stamp_text
+from engram.places.words import vocabulary_problems
 
 
 def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
@@ -67,6 +68,7 @@ def list_sessions(path: Path, at: int | str | None = None) -> list[dict[str, Any
             "longitude_deg": one.longitude_deg,
             "zone": one.zone,
             "hour": hour_of_day(one, one.start_ns),
+            "note": zone_note(one),
             "nodes": nodes[one.id],
             "path_entries": entries[path_id(one.id)],
             "descriptor": str(frontends[one.id][0]),
@@ -145,10 +147,11 @@ def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:
         with Map.open(path, writes=True) as store:
             removed = store.clean()
     report = check_file(path)
+    problems = [*report.problems, *vocabulary_problems(path)]
     return {
-        "sound": report.sound,
+        "sound": not problems,
         "problems": [
-            {"table": one.table, "record": one.record, "fact": one.fact} for one in report.problems
+            {"table": one.table, "record": one.record, "fact": one.fact} for one in problems
         ],
         "rows": report.rows,
         "blobs": report.blobs,

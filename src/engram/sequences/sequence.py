@@ -12,7 +12,7 @@ import numpy as np
 from engram.errors import InputError
 from engram.frontend import Frame, StereoPair
 from engram.geometry import StereoCamera
-from engram.graph.model import Clock, Session, session_id
+from engram.graph.model import LONGEST_NAME, Clock, Session, session_id
 from engram.odometry import OdometryStep
 
 # Robot name of a drive if neither source nor caller gives one.
@@ -108,14 +108,17 @@ def check_name(robot: str) -> str:
     """The name of a robot, as maps store it.
 
     Raises:
-        InputError: it is empty, or not Unicode text.
+        InputError: it is empty, too long, or not Unicode text.
     """
     try:
-        if robot and robot.encode():
+        if robot and robot.encode() and len(robot) <= LONGEST_NAME:
             return robot
-    except (AttributeError, UnicodeEncodeError):
+    except (AttributeError, UnicodeEncodeError, TypeError):
         pass
-    raise InputError(f"the robot's name is {robot!r}, must be Unicode text, such as r1")
+    raise InputError(
+        f"the robot's name is {robot!r:.60}, must be Unicode text of 1 to {LONGEST_NAME} "
+        "characters, such as r1"
+    )
 
 
 def session_of(

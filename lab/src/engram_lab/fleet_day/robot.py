@@ -16,6 +16,7 @@ from engram.agent.link import Unreachable
 from engram.agent.sending import QUEUED, SENT
 from engram.centre.service import Centre
 from engram.centre.worker.loop import work_off
+from engram.centre.worker.merging import merge_hand_in
 from engram.errors import EngramError
 from engram.geometry import SE3
 from engram.localiser import Position
@@ -170,7 +171,7 @@ class DayRobot:
                 if not isinstance(agent.trouble, Unreachable | None):
                     raise EngramError(f"{what}: {agent.trouble}") from agent.trouble
                 breaks += agent.trouble is not None
-                work_off(self._centre)
+                work_off(self._centre, merge_hand_in)
                 part.advance(f"the link broke {breaks} times")
         raise EngramError(
             f"{what}: not over after {_ROUNDS} rounds, in which the link broke {breaks} times; "

@@ -18,6 +18,7 @@ from engram.centre.handins import HandIns
 from engram.centre.service import Centre, MapPolicy
 from engram.centre.settings import CentreSettings
 from engram.centre.worker.loop import work_off
+from engram.centre.worker.merging import merge_hand_in
 from engram.fleet.merge import MergeOptions
 from engram.maps import Map, check_file
 from engram.transfers import MAX_PART_BYTES, Manifest, PartHash, bundle, part_hash
@@ -59,7 +60,7 @@ class Site:
             self._bomb,
         )
         chance.choice(kinds)(chance)
-        work_off(self.centre)
+        work_off(self.centre, merge_hand_in)
         for row in HandIns(self.centre).listed(_MAP, None, "open", 2**62, 10):
             if row["robot"] == self._thief.state.fact("robot"):
                 HandIns(self.centre).cancel(row, "lab")

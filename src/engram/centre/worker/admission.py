@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from engram.errors import EngramError, MapCorruptError, StorageFullError, WorkerError
-from engram.maps import check_file
+from engram.places.words import problems_of
 from engram.processes import end_with_parent
 from engram.transfers import Manifest, PartHash, join
 
@@ -95,7 +95,7 @@ def write_checked(manifest: Manifest, parts: dict[PartHash, bytes], path: Path) 
         MapCorruptError: the parts make no sound map.
     """
     join(manifest, parts.get, path, thin=True)
-    problems = check_file(path, thin=True).problems
+    problems = problems_of(path, thin=True)
     if problems:
         shown = "; ".join(map(str, problems[:_SHOWN_PROBLEMS]))
         raise MapCorruptError(f"{len(problems)} faults: {shown}")

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from typing import Any
 
 from engram.centre.downloads import Downloads
 from engram.centre.errors import StoreError
 from engram.centre.handins import HandIns
 from engram.centre.service import Centre
+from engram.centre.worker.apart import merge_apart
 from engram.centre.worker.dreaming import dream_a_while
-from engram.centre.worker.merging import WaitsError, merge_hand_in
+from engram.centre.worker.merging import WaitsError
 from engram.centre.worker.sweeping import sweep_all
 from engram.errors import EngramError, StorageFullError
 
@@ -20,8 +22,12 @@ _AGAIN_S = 10.0
 _HOUR_NS = 3_600_000_000_000
 
 
-def work_off(centre: Centre) -> int:
+def work_off(centre: Centre, take: Callable[[Centre, dict[str, Any]], None] = merge_apart) -> int:
     """Does what there is to do; returns the number of settled jobs.
+
+    Args:
+        centre: the centre.
+        take: merges a hand-in.
 
     Raises:
         EngramError: what hinders the centre; of each map, after all of them had their turn. Jobs
@@ -38,7 +44,7 @@ def work_off(centre: Centre) -> int:
             with centre.lane(name) as is_ours:
                 for row in handins.waiting(name) if is_ours else ():
                     settled += _make_downloads(centre, hindered)
-                    merge_hand_in(centre, row)
+                    take(centre, row)
                     settled += 1
         except WaitsError as error:  # the next map may have its disk and its drives
             hindered.append(error)
@@ -74,6 +80,9 @@ def work(
                 continue
         except (EngramError, OSError) as error:
             _log.error("%s; tried again in %g s", centre.words_of(error), _AGAIN_S)
+            wait(_AGAIN_S)
+        except Exception:  # of what robots sent: the others' work goes on
+            _log.exception("a fault that Engram does not know; tried again in %g s", _AGAIN_S)
             wait(_AGAIN_S)
         else:
             wait(centre.settings.poll_s)

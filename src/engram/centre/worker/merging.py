@@ -79,6 +79,10 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
         handins.end(row, HandInState.CANCELLED, error="cancelled")
     except EngramError as error:
         handins.end(row, HandInState.FAILED, error=centre.words_of(error))
+    except Exception as error:  # a stranger's map may bring about any: it ends this hand-in alone
+        _log.exception("%s: hand-in %s", row["map"], row["id"][:8])
+        fact = f"a fault that Engram does not know, {centre.fault_of(error)}"
+        handins.end(row, HandInState.FAILED, error=fact)
     else:
         _settle(centre, handins, row, outcome)
         took_s = time.monotonic() - begun_s

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from engram.doctor.examination import Array, Evidence
+from engram.graph.clock import known_zone
 from engram.graph.model import Clock
 
 # Units in which somebody may have counted frames, ns.
@@ -78,7 +79,7 @@ def rate_hz(seen: Evidence) -> float | None:
 def hours_unknown(seen: Evidence) -> float | None:
     """How much is unknown of two: that the stamps are UTC, and where on earth that was."""
     facts = seen.facts
-    nowhere = facts.zone is None and facts.longitude_deg is None
+    nowhere = facts.longitude_deg is None and known_zone(facts.zone) is None
     return float((facts.clock is not Clock.UTC) + nowhere)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from engram.errors import InputError
 from engram.graph.attempts import Attempts
 from engram.graph.basin import BasinCounts
-from engram.graph.clock import hour_of_day
+from engram.graph.clock import hour_of_day, zone_note
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, Node, NodeId, PathEntry, PathId, Session, SessionId
 from engram.maps import Map
@@ -98,8 +99,8 @@ class Stock:
             without = [one for one in self.sessions if hour_of_day(one, one.start_ns) is None]
             listed = ", ".join(f"{one.robot} {str(one.id)[:8]}" for one in without[:_LISTED])
             raise InputError(
-                f"no node of {self.store.location} has a known hour of day: {len(without)} of "
-                f"{len(self.sessions)} sessions ({listed}…) have no UTC clock or neither longitude "
+                f"{_zones_told(without)}no node of {self.store.location} has a known hour of day: "
+                f"{len(without)} of {len(self.sessions)} sessions ({listed}…) have no UTC clock or neither longitude "
                 "nor time zone; set it with engram amend, or choose --select "
                 "copy, region or route"
             )
@@ -160,3 +161,9 @@ class Stock:
     def place_of(self, session: SessionId) -> int:
         """Place of a session in `sessions`."""
         return next(at for at, one in enumerate(self.sessions) if one.id == session)
+
+
+def _zones_told(sessions: Sequence[Session]) -> str:
+    """What keeps the hours of these sessions unknown though they have zones."""
+    notes = {note: None for one in sessions if (note := zone_note(one))}
+    return "".join(f"{note}; " for note in notes)

@@ -11,7 +11,7 @@ import numpy as np
 from engram.errors import EngramError, IncompatibleError, MapCorruptError
 from engram.frontend import DescriptorKind, feature_kind
 from engram.geometry import SE3, StereoCamera
-from engram.graph.clock import check_longitude, check_zone
+from engram.graph.clock import check_longitude, is_zone_name
 from engram.graph.model import Clock
 from engram.sequences.sequence import SequenceInfo
 
@@ -87,7 +87,8 @@ class FrameLogHeader:
                 None if values["zone"] is None else _text(values["zone"]),
             )
             check_longitude(info.longitude_deg)
-            check_zone(info.zone)
+            if info.zone is not None and not is_zone_name(info.zone):
+                raise ValueError(f"{info.zone!r:.40} is not a time zone")
             return FrameLogHeader(
                 info,
                 camera,
