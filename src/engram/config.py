@@ -27,6 +27,11 @@ from engram.errors import ConfigError
 
 T = TypeVar("T")
 
+# Engram's own longest, all settings with what they mean, has 35,000 characters.
+_MOST_CHARACTERS = 400_000
+_MOST_DOTS = 100
+_SHOWN_CHARACTERS = 80
+
 
 def load_toml(text: str, kind: type[T], ignored: Collection[str] = ()) -> T:
     """Check TOML text against a dataclass and build it.
@@ -40,11 +45,25 @@ def load_toml(text: str, kind: type[T], ignored: Collection[str] = ()) -> T:
         ConfigError: the text is not TOML, a key is unknown at any depth, or a value has the wrong
             type or fails the dataclass's own checks.
     """
+    return from_dict(read_toml(text), kind, ignored)
+
+
+def read_toml(text: str) -> dict[str, Any]:
+    """The values of a TOML text of any origin.
+
+    Raises:
+        ConfigError: it is not TOML, or beyond what settings and calibrations hold.
+    """
+    if len(text) > _MOST_CHARACTERS:
+        raise ConfigError(f"{len(text)} characters, at most {_MOST_CHARACTERS} are read")
+    for number, line in enumerate(text.splitlines(), start=1):
+        # The parser takes time by the square of a key's parts.
+        if line.count(".") > _MOST_DOTS and not line.lstrip().startswith("#"):
+            raise ConfigError(f"line {number} has more than {_MOST_DOTS} dots: break it into lines")
     try:
-        values = tomllib.loads(text)
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # also numbers of thousands of digits
         raise ConfigError(f"not valid TOML: {error}") from error
-    return from_dict(values, kind, ignored)
 
 
 def from_dict(values: dict[str, Any], kind: type[T], ignored: Collection[str] = ()) -> T:
@@ -68,7 +87,16 @@ def _in_words(error: msgspec.ValidationError, values: dict[str, Any]) -> str:
     wanted = what.partition(", got")[0].replace("Expected ", "must be ").replace("`", "")
     if wanted.startswith("Invalid enum"):
         wanted = "not one of its names; engram settings show describes them"
-    return f"{key} is {found!r}: {wanted}"
+    return f"{key} is {_shown(found)}: {wanted}"
+
+
+def _shown(value: Any) -> str:
+    """The beginning of a value of any size."""
+    try:
+        text = repr(value)
+    except ValueError:  # an integer of thousands of digits
+        return "a number of too many digits"
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -180,6 +208,7 @@ def _refuse_unknown_keys(values: Any, kind: Any, where: str, ignored: Collection
                 f"did you mean {one}? " for one in difflib.get_close_matches(key, names, 1)
             )
             raise ConfigError(
-                f"unknown setting '{where}{key}'; {near}known here: {', '.join(names)}"
+                f"unknown setting '{where}{key:.{_SHOWN_CHARACTERS}}'; {near}known here: "
+                f"{', '.join(names)}"
             )
         _refuse_unknown_keys(value, known[key], f"{where}{key}.")

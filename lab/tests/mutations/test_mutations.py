@@ -11,7 +11,7 @@ import pytest
 
 from engram_lab.checks.mutations import CHANGES, FAULTS, Harness
 from engram_lab.mutations import forks
-from engram_lab.mutations.forks import Outcome, tried
+from engram_lab.mutations.forks import Limits, Outcome, tried
 
 
 @pytest.fixture(scope="module")
@@ -76,11 +76,10 @@ def wait(_):
     ],
 )
 def test_each_outcome_is_told_apart(tmp_path, monkeypatch, work, outcome):
-    if work is spin:
-        monkeypatch.setattr(forks, "HANG_S", 1.0)
+    limits = Limits(seconds=1.0) if work is spin else None
     if work is wait:
         monkeypatch.setattr(forks, "_STUCK_S", 0.5)
-    assert tried(work, tmp_path).outcome is outcome
+    assert tried(work, tmp_path, limits).outcome is outcome
 
 
 def test_writing_outside_its_folder_is_a_deed(tmp_path):

@@ -48,16 +48,43 @@ def read_yaml(text: str) -> dict[str, Any]:
     # OpenCV writes "%YAML:1.0", which is not a valid YAML directive.
     text = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
     if len(text) > MAX_CHARACTERS:
-        raise CalibrationError(f"{len(text)} characters, too long for a calibration")
+        raise CalibrationError(
+            f"{len(text)} characters, too long: at most {MAX_CHARACTERS} are read"
+        )
     try:
         # The base loader makes strings, lists and dictionaries, nothing else.
         entries = yaml.load(text, Loader=yaml.BaseLoader)
+        spread = _characters(entries, {})
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         fact = str(error).splitlines()[0] if str(error) else "malformed"
         raise CalibrationError(f"not valid YAML: {fact}") from error
+    if spread > 4 * MAX_CHARACTERS:  # without aliases it is at most twice the text
+        raise CalibrationError("its aliases make too much of a short text; write it out")
     if not isinstance(entries, dict):
         raise CalibrationError("holds no calibration (a table of names and values)")
     return entries
+
+
+def _characters(value: Any, known: dict[int, int]) -> int:
+    """Length of what a YAML text stands for with its aliases written out, which nobody does here.
+
+    Args:
+        value: of the base loader.
+        known: lengths by identity; 0 while one is counted.
+
+    Raises:
+        ValueError: something holds itself.
+    """
+    if not isinstance(value, list | dict):
+        return 1 + len(value or "")
+    length = known.setdefault(id(value), -1)
+    if length == 0:
+        raise ValueError("an alias holds itself")
+    if length < 0:
+        known[id(value)] = 0
+        parts = [*value, *value.values()] if isinstance(value, dict) else value
+        length = known[id(value)] = 1 + sum(_characters(one, known) for one in parts)
+    return length
 
 
 def entry(entries: dict[str, Any], name: str) -> Any:
@@ -157,7 +184,9 @@ def distortion_model(value: Any, name: str = "distortion_model") -> DistortionMo
 
 def _model_name(value: Any) -> str:
     """A model's name in one spelling: small letters, words joined by underscores."""
-    return re.sub(r"[\s_-]+", "_", str(value).strip().lower())
+    if not isinstance(value, str):  # of a stranger: written out it may be long
+        return "no text"
+    return re.sub(r"[\s_-]+", "_", value.strip().lower())
 
 
 def lens_of(

@@ -51,7 +51,8 @@ def parse_camchain(entries: dict[str, Any], field_of_view_deg: float | None = No
 
 
 def _lens(side: dict[str, Any]) -> RawCamera:
-    model = str(entry(side, "camera_model")).strip().lower()
+    stated = entry(side, "camera_model")
+    model = stated.strip().lower() if isinstance(stated, str) else "no text"
     if model != "pinhole":
         raise CalibrationError(
             f"camera_model is {model[:40]!r}, only 'pinhole' is supported; calibrate again with "

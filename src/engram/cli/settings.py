@@ -6,7 +6,6 @@ import dataclasses
 import inspect
 import json
 import re
-import tomllib
 import typing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from msgspec import Meta
 
-from engram.config import check_bounds, from_dict, to_dict
+from engram.config import check_bounds, from_dict, read_toml, to_dict
 from engram.errors import ConfigError
 from engram.fleet.merge.settings import MergeSettings
 from engram.frontend import DescriptorKind
@@ -158,9 +157,9 @@ def read_settings(path: Path | None, changes: Sequence[str] = ()) -> AllSettings
 def _toml(path: Path) -> dict[str, Any]:
     text = settings_text(path)
     try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+        return read_toml(text)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def _change(values: dict[str, Any], change: str) -> None:
@@ -181,8 +180,8 @@ def _change(values: dict[str, Any], change: str) -> None:
 def _value(text: str) -> Any:
     """A TOML value; what is not valid TOML is a word, so that nobody quotes for two shells."""
     try:
-        return tomllib.loads(f"x = {text}")["x"]
-    except ValueError:
+        return read_toml(f"x = {text}")["x"]
+    except ConfigError:
         return text
 
 

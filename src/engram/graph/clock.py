@@ -89,13 +89,15 @@ def check_longitude(longitude_deg: float | None) -> None:
         raise ConfigError(f"longitude is {longitude_deg}, must be in [-180, 180] degrees east")
 
 
-@lru_cache
 def known_zone(zone: str | None) -> ZoneInfo | None:
     """The time zone of a name; None for None, and for one that this machine does not know."""
-    if zone is None or not is_zone_name(zone):
-        return None
+    return _looked_up(zone) if zone is not None and is_zone_name(zone) else None
+
+
+@lru_cache
+def _looked_up(name: str) -> ZoneInfo | None:
     try:
-        return ZoneInfo(zone)
+        return ZoneInfo(name)
     except (KeyError, ValueError, OSError):  # not found; malformed; a folder of the database
         return None
 
@@ -111,9 +113,13 @@ def zone_note(source: Clocked) -> str:
     if not unplaced or source.zone is None or known_zone(source.zone) is not None:
         return ""
     return (
-        f"time zone {source.zone!r} is unknown to this machine: update its time zone database, or "
-        "correct the zone with engram amend"
+        f"time zone {_shown(source.zone)} is unknown to this machine: update its time zone "
+        "database, or correct the zone with engram amend"
     )
+
+
+def _shown(zone: str) -> str:
+    return repr(zone if len(zone) <= _SHOWN_CHARACTERS else f"{zone[:_SHOWN_CHARACTERS]}…")
 
 
 def check_zone(zone: str | None) -> None:
@@ -124,6 +130,5 @@ def check_zone(zone: str | None) -> None:
     """
     if zone is not None and known_zone(zone) is None:
         raise ConfigError(
-            f"time zone {zone!r:.{_SHOWN_CHARACTERS}} is unknown; give an IANA name such as "
-            "Europe/Berlin"
+            f"time zone {_shown(zone)} is unknown; give an IANA name such as Europe/Berlin"
         )

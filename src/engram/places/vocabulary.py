@@ -172,8 +172,8 @@ def decode_vocabulary(body: bytes) -> Vocabulary:
 def default_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
     """The vocabulary of a map that has none of its own.
 
-    For the kinds of this package a small one, trained on simulated drives; for others one with a
-    single word, by which all places look alike.
+    For the kinds of this package a small one, trained on simulated drives; for others
+    `one_word_vocabulary`.
 
     Raises:
         IncompatibleError: the kind is unknown.
@@ -181,6 +181,15 @@ def default_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
     file = resources.files("engram.places") / "data" / f"{plain_name(descriptor)}.safetensors"
     if file.is_file():
         return decode_vocabulary(file.read_bytes())
+    return one_word_vocabulary(descriptor)
+
+
+def one_word_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
+    """A vocabulary by which all places look alike.
+
+    Raises:
+        IncompatibleError: the kind is unknown.
+    """
     root_and_word = np.zeros((2, feature_kind(descriptor).descriptor_bytes), np.uint8)
     tree = TreeArrays(root_and_word, np.array([1, 2, 2], np.int32))
     one, none = np.ones(1, np.int32), np.zeros(1, np.int32)

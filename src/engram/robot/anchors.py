@@ -8,11 +8,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-import yaml
-
+from engram.calibration.entries import MAX_CHARACTERS, read_yaml
 from engram.errors import ConfigError, InputError
 from engram.maps.map_frame import FARTHEST_M
+from engram.sequences.images import image_size
 from engram.sequences.options import parse_start
 from engram.untrusted import read_text
 
@@ -160,18 +159,15 @@ def _time_ns(text: str, line: int, source: Path) -> int:
 def on_grid(given: list[GivenAnchor], grid: Path) -> list[GivenAnchor]:
     """Pixels of an occupancy grid as metres in its frame; metres stay."""
     try:
-        about = yaml.safe_load(grid.read_text(encoding="utf-8"))
+        about = read_yaml(read_text(grid, InputError, 4 * MAX_CHARACTERS))
         resolution = float(about["resolution"])
         left, bottom, turned = (float(value) for value in about["origin"][:3])
         picture = grid.parent / str(about["image"])
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:  # InputError is a ValueError
         raise InputError(f"{grid}: is not a map.yaml of an occupancy grid: {error}") from error
     if turned:
         raise InputError(f"{grid}: its origin is turned by {turned} rad; only 0 is supported")
-    image = cv2.imread(str(picture), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise InputError(f"{picture}: the image of {grid} cannot be read")
-    height = image.shape[0]
+    _, height = image_size(picture)
     return [
         GivenAnchor(
             one.line, one.node, one.time_ns,

@@ -7,6 +7,7 @@ nothing.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -30,6 +31,11 @@ IMAGE_SUFFIXES = frozenset(
 _MAX_FILE_BYTES = 400_000_000
 _MAX_PIXELS = 64_000_000
 
+
+# A header with its comments and colour profiles.
+_HEADER_BYTES = 1_000_000
+_TIFF_ENTRIES = 1000
+_TIFF_NUMBERS = {3: "H", 4: "I", 16: "Q"}
 
 _BGR_INDEX = {Channel.BLUE: 0, Channel.GREEN: 1, Channel.RED: 2}
 
@@ -62,7 +68,7 @@ def decoded(
     Raises:
         SequenceError: it is cut short, of an unknown type, or of another size.
     """
-    _check_size(where, header_size(content), size)
+    _check_size(where, _claimed(where, content), size)
     if content.startswith(b"\xff\xd8") and not _jpeg_is_whole(content):
         # libjpeg would fill the missing rows with grey and only warn.
         raise SequenceError(f"{where}: the JPEG is cut short ({len(content)} bytes)")
@@ -84,16 +90,12 @@ def grey(
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, px, decoded only if its header is not understood.
+    """Width and height of an image file, px, by its header.
 
     Raises:
         SequenceError: the file is missing or not an image.
     """
-    content = _read_bytes(path)
-    size = header_size(content)
-    if size is None:
-        height, width = _decoded(path, content).shape[:2]
-        size = (width, height)
+    size = _claimed(path, _read_bytes(path))
     check_not_huge(path, size)
     return size
 
@@ -105,27 +107,19 @@ def image_bits(path: Path) -> int | None:
         SequenceError: the file is missing or not an image.
     """
     content = _read_bytes(path)
-    size = header_size(content)
-    if size is not None:
-        check_not_huge(path, size)
+    check_not_huge(path, _claimed(path, content))
     image = _decoded(path, content)
     return int(image.max()).bit_length() if image.dtype == np.uint16 else None
 
 
 def header_size(content: bytes) -> tuple[int, int] | None:
-    """Width and height that a PNG, JPEG, BMP or PNM header claims, px; None for other kinds."""
-    try:
-        if content.startswith(b"\x89PNG\r\n\x1a\n"):
-            return struct.unpack(">II", content[16:24])
-        if content.startswith(b"\xff\xd8"):
-            return _jpeg_size(content)
-        if content.startswith(b"BM"):
-            width, height = struct.unpack("<ii", content[18:26])
-            return width, abs(height)
-        if content[:1] == b"P" and content[1:2] in b"123456":
-            return _pnm_size(content)
-    except (struct.error, ValueError):
-        return None
+    """Width and height that an image's header claims, px; None for what is no known image."""
+    for begins, size_in in _SIZES:
+        if content.startswith(begins):
+            try:
+                return size_in(content)
+            except (struct.error, ValueError):
+                return None
     return None
 
 
@@ -138,22 +132,30 @@ def _read_bytes(path: Path) -> bytes:
     return content
 
 
+def _claimed(where: object, content: bytes) -> tuple[int, int]:
+    size = header_size(content)
+    if size is None:
+        raise _unreadable(where, content)
+    return size
+
+
+def _unreadable(where: object, content: bytes) -> SequenceError:
+    return SequenceError(
+        f"{where}: no readable image ({len(content)} bytes): damaged, cut short, or something else"
+    )
+
+
 def _decoded(path: object, content: bytes) -> NDArray[np.generic]:
     try:
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise SequenceError(f"{path}: cannot be decoded: {error.err or error}") from error
     if image is None:
-        raise SequenceError(
-            f"{path}: no readable image ({len(content)} bytes): damaged, cut short, or something "
-            "else"
-        )
+        raise _unreadable(path, content)
     return image
 
 
-def _check_size(path: object, size: tuple[int, int] | None, wanted: tuple[int, int] | None) -> None:
-    if size is None:
-        return
+def _check_size(path: object, size: tuple[int, int], wanted: tuple[int, int] | None) -> None:
     check_not_huge(path, size)
     if wanted is not None and size != wanted:
         raise SequenceError(
@@ -205,12 +207,99 @@ def _jpeg_is_whole(content: bytes) -> bool:
     return scan > 0 and content.find(b"\xff\xd9", scan) >= 0
 
 
+def _png_size(content: bytes) -> tuple[int, int]:
+    return struct.unpack(">II", content[16:24])
+
+
+def _bmp_size(content: bytes) -> tuple[int, int]:
+    (header,) = struct.unpack("<I", content[14:18])
+    if header == 12:  # of OS/2
+        return struct.unpack("<HH", content[18:22])
+    width, height = struct.unpack("<ii", content[18:26])
+    return width, abs(height)
+
+
 def _pnm_size(content: bytes) -> tuple[int, int] | None:
-    lines = (line.split(b"#", 1)[0] for line in content[2:1024].split(b"\n"))
-    numbers = b" ".join(lines).split()
+    if content[1:2] not in b"123456":
+        return None
+    lines = (line.split(b"#", 1)[0] for line in content[2:_HEADER_BYTES].split(b"\n"))
+    numbers = b" ".join(lines).split(maxsplit=2)
     if len(numbers) < 2 or max(map(len, numbers[:2])) > 9:
         return None
     return int(numbers[0]), int(numbers[1])
+
+
+def _tiff_size(content: bytes) -> tuple[int, int] | None:
+    """Of the first image: OpenCV decodes that."""
+    order = "<" if content[:2] == b"II" else ">"
+    (version,) = struct.unpack(f"{order}H", content[2:4])
+    big = version == 43
+    where, count, row = ("Q", "Q", "HHQ8s") if big else ("I", "H", "HHI4s")
+    at, entry = 8 if big else 4, struct.Struct(order + row)
+    (at,) = struct.unpack_from(order + where, content, at)
+    (entries,) = struct.unpack_from(order + count, content, at)
+    at += struct.calcsize(order + count)
+    found: dict[int, int] = {}
+    for number in range(min(entries, _TIFF_ENTRIES)):
+        tag, kind, _, value = entry.unpack_from(content, at + number * entry.size)
+        if tag in {256, 257} and kind in _TIFF_NUMBERS:
+            (found[tag],) = struct.unpack_from(order + _TIFF_NUMBERS[kind], value)
+    return (found[256], found[257]) if len(found) == 2 else None
+
+
+def _webp_size(content: bytes) -> tuple[int, int] | None:
+    match content[8:16]:
+        case b"WEBPVP8 ":
+            width, height = struct.unpack("<HH", content[26:30])
+            return width & 0x3FFF, height & 0x3FFF
+        case b"WEBPVP8L":
+            (bits,) = struct.unpack("<I", content[21:25])
+            return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+        case b"WEBPVP8X":
+            sides = (int.from_bytes(content[at : at + 3], "little") + 1 for at in (24, 27))
+            return next(sides), next(sides)
+    return None
+
+
+def _jpeg_2000_size(content: bytes) -> tuple[int, int] | None:
+    """The largest that any code stream claims, whatever the boxes around say."""
+    return _largest(content, b"\xff\x4f\xff\x51", 8)
+
+
+def _avif_size(content: bytes) -> tuple[int, int] | None:
+    return _largest(content, b"ispe", 8) if content[4:8] == b"ftyp" else None
+
+
+def _largest(content: bytes, mark: bytes, after: int) -> tuple[int, int] | None:
+    """The largest width and height of those that stand behind a mark in the header."""
+    found, at = list[tuple[int, int]](), content.find(mark, 0, _HEADER_BYTES)
+    while at >= 0:
+        found.append(struct.unpack_from(">II", content, at + after))
+        at = content.find(mark, at + 1, _HEADER_BYTES)
+    return max(found, key=lambda one: one[0] * one[1], default=None)
+
+
+def _sun_raster_size(content: bytes) -> tuple[int, int]:
+    return struct.unpack(">II", content[4:12])
+
+
+# How the images of each kind begin, and where they claim their size. What is not here is not
+# decoded: OpenCV knows more kinds, and makes all that a file of a few bytes claims.
+_SIZES: tuple[tuple[bytes, Callable[[bytes], tuple[int, int] | None]], ...] = (
+    (b"\x89PNG\r\n\x1a\n", _png_size),
+    (b"\xff\xd8", _jpeg_size),
+    (b"BM", _bmp_size),
+    (b"P", _pnm_size),
+    (b"II*\0", _tiff_size),
+    (b"MM\0*", _tiff_size),
+    (b"II+\0", _tiff_size),
+    (b"MM\0+", _tiff_size),
+    (b"RIFF", _webp_size),
+    (b"\0\0\0\x0cjP  ", _jpeg_2000_size),
+    (b"\xff\x4f\xff\x51", _jpeg_2000_size),
+    (b"\x59\xa6\x6a\x95", _sun_raster_size),
+    (b"\0\0\0", _avif_size),
+)
 
 
 def _eight_bit(path: object, image: NDArray[np.generic]) -> NDArray[np.uint8]:

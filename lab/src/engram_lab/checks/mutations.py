@@ -4,9 +4,9 @@
     python -m engram_lab.checks.mutations --case 1234        # one of them again, with all details
 
 Each case is a change of a sound file, drawn by its number, and read in a child in every way that
-users read it. Crashes, hangs (10 s), more than 1 GB, exceptions that are not Engram's own, code of
-the file that ran, and changes that no check sees are faults. Results go to a file as they come; the
-same command goes on where it stopped.
+users read it. Crashes, hangs (10 s; of texts 2 s), more than 1 GB (of texts 200 MB), exceptions
+that are not Engram's own, code of the file that ran, and changes that no check sees are faults.
+Results go to a file as they come; the same command goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -19,19 +19,25 @@ import shutil
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 import cv2
 
-from engram_lab.mutations import bytewise, definitions, handins, rowwise
+from engram_lab.mutations import bytewise, definitions, handins, rowwise, texts
 from engram_lab.mutations.case import Case, Change, Subject
-from engram_lab.mutations.forks import Outcome, Tell, Trial, tried
+from engram_lab.mutations.forks import OF_TEXTS, Outcome, Tell, Trial, tried
 from engram_lab.mutations.reading import Held, held, read
 from engram_lab.mutations.samples import Samples, make_samples
 from engram_lab.programs import Figure, command_line, report
 
+TEXTS: dict[str, Change] = {
+    "text of a calibration": texts.of_a_calibration,
+    "text of settings": texts.of_settings,
+    "name of a zone": texts.of_a_zone,
+}
 CHANGES: dict[str, Change] = {
     "bytes of a map": bytewise.of_a_map,
     "bytes of a map with a log": bytewise.of_a_map_with_a_log,
@@ -46,6 +52,7 @@ CHANGES: dict[str, Change] = {
     "pages of a hand-in": handins.pages,
     "rows of a hand-in": handins.rows,
     "manifests": handins.manifests,
+    **TEXTS,
 }
 # Share of the cases that are merged, which takes longer than all else.
 _MERGED = 0.25
@@ -57,10 +64,12 @@ class Harness:
 
     Args:
         folder: for them and for each changed one in turn.
+        changes: kinds of changes by name.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, changes: Mapping[str, Change] = CHANGES) -> None:
         self._folder = folder
+        self._changes = changes
         self._samples: Samples = make_samples(folder)
         self._held: dict[str, Held] = {
             path.name: held(path)
@@ -78,11 +87,11 @@ class Harness:
 
     def trial(self, number: int, seed: int) -> tuple[str, Trial]:
         """One case: the kind of the change, and what became of it."""
-        kind = list(CHANGES)[number % len(CHANGES)]
+        kind = list(self._changes)[number % len(self._changes)]
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:
             chance = random.Random(f"{seed} {number}")
-            work = partial(self._read, CHANGES[kind], Path(folder), chance)
-            return kind, tried(work, Path(folder))
+            work = partial(self._read, self._changes[kind], Path(folder), chance)
+            return kind, tried(work, Path(folder), OF_TEXTS if kind in TEXTS else None)
 
     def _warm_up(self) -> None:
         """Reads every sound file once, so that children find modules and statements loaded."""
@@ -98,6 +107,10 @@ class Harness:
                 copy = case.path and Path(shutil.copy(case.path, folder))
                 if not read(replace(case, path=copy), Path(folder), merges=True):
                     raise AssertionError(f"a sound {case.subject} does not pass its check")
+
+        for case in texts.sound(self._folder):
+            if not read(case, self._folder, merges=False):
+                raise AssertionError(f"the sound {case.what} is refused")
 
     def _read(
         self, change: Change, folder: Path, chance: random.Random, tell: Tell
@@ -123,6 +136,7 @@ def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--cases", type=int, default=1000)
     parser.add_argument("--case", type=int, help="only this one, with its details")
+    parser.add_argument("--texts", action="store_true", help="only calibrations, settings, zones")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, help="one JSON line for each case, resumable")
     asked = parser.parse_args()
@@ -130,7 +144,7 @@ def main() -> None:
     known = _known(asked.out)
     numbers = [asked.case] if asked.case is not None else range(len(known), asked.cases)
     with tempfile.TemporaryDirectory() as folder:
-        harness = Harness(Path(folder))
+        harness = Harness(Path(folder), TEXTS if asked.texts else CHANGES)
         for number in numbers:
             kind, trial = harness.trial(number, asked.seed)
             record = {"number": number, "kind": kind, **asdict(trial)}

@@ -20,6 +20,7 @@ class Subject(StrEnum):
     MAP = "map"
     DRIVE = "drive"
     HANDIN = "hand-in"
+    TEXT = "text"
 
 
 @dataclass(frozen=True, slots=True)

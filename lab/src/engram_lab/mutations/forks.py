@@ -19,8 +19,6 @@ from typing import Any, TypeAlias
 
 from engram.sqlite import SqliteFile
 
-HANG_S = 10.0
-MEMORY_BYTES = 2**30
 # Wall time after which a child that does not even compute is ended.
 _STUCK_S = 300.0
 # Functions of SQL that Engram's own statements call.
@@ -43,6 +41,22 @@ _DEEDS = {
     "ctypes.dlopen",
 }
 
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What reading one changed thing may take.
+
+    Attributes:
+        seconds: processor time.
+        bytes: memory beyond the parent's.
+    """
+
+    seconds: float = 10.0
+    bytes: int = 2**30
+
+
+# A calibration or a file of settings has a few kilobytes.
+OF_TEXTS = Limits(2.0, 200_000_000)
 # Names the change that is tried.
 Tell: TypeAlias = Callable[[str], None]
 
@@ -83,23 +97,25 @@ class Trial:
     megabytes: float = 0.0
 
 
-def tried(work: Work, folder: Path) -> Trial:
+def tried(work: Work, folder: Path, limits: Limits | None = None) -> Trial:
     """Runs `work` in a child.
 
     Args:
         work: names the change to its argument, and returns outcome and detail.
         folder: the only one in which the child may write.
+        limits: what it may take; None for the usual ones.
     """
+    limits = limits or Limits()
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
         os.close(read)
-        _in_child(work, folder, write)
+        _in_child(work, folder, write, limits)
     os.close(write)
     told, stuck = _heard(read, child)
     _, status, used = os.wait4(child, 0)
     spent_s = used.ru_utime + used.ru_stime
-    return _judged(told, status, stuck, spent_s)
+    return _judged(told, status, stuck, spent_s, limits)
 
 
 def _heard(read: int, child: int) -> tuple[list[dict[str, Any]], bool]:
@@ -121,7 +137,9 @@ def _lines(told: bytes) -> list[dict[str, Any]]:
     return [json.loads(line) for line in told.splitlines()]
 
 
-def _judged(told: list[dict[str, Any]], status: int, stuck: bool, spent_s: float) -> Trial:
+def _judged(
+    told: list[dict[str, Any]], status: int, stuck: bool, spent_s: float, limits: Limits
+) -> Trial:
     facts: dict[str, Any] = {}
     for one in told:
         facts |= one
@@ -130,17 +148,17 @@ def _judged(told: list[dict[str, Any]], status: int, stuck: bool, spent_s: float
     detail = facts.get("detail", "")
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
-        hung = stuck or number == signal.SIGXCPU or spent_s > HANG_S
+        hung = stuck or number == signal.SIGXCPU or spent_s > limits.seconds
         outcome = Outcome.HANG if hung else Outcome.CRASH
         detail = signal.Signals(number).name
-    elif grown * 1e6 > MEMORY_BYTES:
+    elif grown * 1e6 > limits.bytes:
         outcome = Outcome.MEMORY
-    elif spent_s > HANG_S and outcome in {Outcome.READ, Outcome.REFUSED}:
+    elif spent_s > limits.seconds and outcome in {Outcome.READ, Outcome.REFUSED}:
         outcome = Outcome.HANG
     return Trial(outcome, what, detail, round(spent_s, 3), round(grown, 1))
 
 
-def _in_child(work: Work, folder: Path, write: int) -> None:
+def _in_child(work: Work, folder: Path, write: int, limits: Limits) -> None:
     """Never returns."""
 
     def tell(**facts: object) -> None:
@@ -150,7 +168,7 @@ def _in_child(work: Work, folder: Path, write: int) -> None:
     started_kb = _peak_kb()
     try:
         _watch(deeds, folder)
-        _limit()
+        _limit(limits)
         outcome, detail = work(lambda what: tell(what=what))
     except MemoryError:
         outcome, detail = Outcome.MEMORY, traceback.format_exc(limit=-4)
@@ -168,11 +186,11 @@ def _peak_kb() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def _limit() -> None:
+def _limit(limits: Limits) -> None:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    most = pages * resource.getpagesize() + MEMORY_BYTES + 2**28
+    most = pages * resource.getpagesize() + limits.bytes + 2**28
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    whole = int(HANG_S) + 1
+    whole = int(limits.seconds) + 1
     resource.setrlimit(resource.RLIMIT_CPU, (whole, whole + 2))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 

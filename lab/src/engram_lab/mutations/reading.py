@@ -11,13 +11,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from engram.calibration import calibration_toml, read_calibration
+from engram.calibration.toml import CalibrationFile
 from engram.centre.worker.admission import write_checked
+from engram.cli.settings import read_settings
+from engram.config import load_toml
 from engram.errors import EngramError
 from engram.fleet.merge import MergeOptions, merge
-from engram.graph.clock import hour_of_day
+from engram.graph.clock import check_zone, hour_of_day, zone_note
+from engram.graph.model import Clock
 from engram.maps import Map, check_file, copy_map
 from engram.places import decode_vocabulary
-from engram.sequences import FrameLog
+from engram.sequences import FrameLog, SequenceInfo
 from engram.sequences.framelog.file import FLIGHT_SUFFIX
 from engram.sequences.framelog.flight import read_decisions, read_images, read_report
 from engram.transfers import Manifest, split
@@ -52,6 +57,8 @@ def read(case: Case, folder: Path, *, merges: bool) -> bool:
     if case.subject is Subject.HANDIN:
         return _hand_in(case, folder, merges)
     assert case.path is not None
+    if case.subject is Subject.TEXT:
+        return _read_text(case.path)
     if case.subject is Subject.MAP:
         return _read_map(case.path, folder, merges)
     return _read_drive(case.path)
@@ -167,6 +174,25 @@ def _read_drive(path: Path) -> bool:
             for number in read_decisions(path):
                 read_images(path, number)
             return True
+        return False
+    return True
+
+
+def _read_text(path: Path) -> bool:
+    """A calibration by its suffix; settings and zones by their names."""
+    try:
+        if path.name == "settings.toml":
+            read_settings(path, [])
+        elif path.name == "zone.txt":
+            zone = path.read_bytes().decode("utf-8", "surrogatepass")
+            source = SequenceInfo("x", "folder", Clock.UTC, zone=zone)
+            assert hour_of_day(source, 0) is None or not zone_note(source)
+            check_zone(zone)
+        else:
+            calibration_toml(read_calibration(path))
+            if path.suffix == ".toml":
+                load_toml(path.read_text(), CalibrationFile)
+    except EngramError:
         return False
     return True
 

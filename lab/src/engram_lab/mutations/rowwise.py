@@ -38,7 +38,7 @@ def blobs_of_a_map(samples: Samples, folder: Path, chance: random.Random) -> Cas
     """Landmarks, thumbnails, attempts under right hashes and checksums."""
     path = Path(shutil.copy(samples.town, folder / "town.engram"))
     with closing(sqlite3.connect(path)) as connection, connection:
-        what = chance.choice([_landmarks, _thumbnail, _attempts])(connection, chance)
+        what = chance.choice([_landmarks, _thumbnail, _attempts, _vocabulary])(connection, chance)
     return Case(Subject.MAP, what, sealed=True, path=path)
 
 
@@ -134,6 +134,14 @@ def _thumbnail(connection: sqlite3.Connection, chance: random.Random) -> str:
     picture = values.picture(frame["thumbnail"], chance)
     _update(connection, frames, sealed(frames, {**frame, "thumbnail": picture}))
     return f"thumbnail of node row {frame['node']}"
+
+
+def _vocabulary(connection: sqlite3.Connection, chance: random.Random) -> str:
+    table = metadata.tables["vocabularies"]
+    row = _any_row(connection, table, chance)
+    body = values.landmarks(row["body"], chance)
+    _update(connection, table, sealed(table, {**row, "body": body, "hash": content_digest(body)}))
+    return f"vocabulary row {row['key']}"
 
 
 def _attempts(connection: sqlite3.Connection, chance: random.Random) -> str:

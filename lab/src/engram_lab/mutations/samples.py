@@ -29,6 +29,7 @@ from engram.graph.model import (
 )
 from engram.maps import Map, RevisionWriter, copy_map
 from engram.odometry import OdometryStatus, OdometryStep
+from engram.places.vocabulary import encode_vocabulary, one_word_vocabulary
 from engram.sequences import FrameLogHeader, FrameLogWriter, LoggedFrame, SequenceInfo
 from engram.sequences.framelog.flight import FlightWriter
 from engram.transfers import PartHash, split
@@ -104,7 +105,8 @@ def _make_map(path: Path) -> None:
             writer.add_omission(Omission(gone, first[0], SE3.identity(), bytes(range(16))))
             writer.put_statistic("speed", {"mean": 1.5})
             writer.commit()
-        store.put_vocabulary(b"words" * 20, author="lab", message="words", configuration={})
+        words = encode_vocabulary(one_word_vocabulary(DESCRIPTOR))
+        store.put_vocabulary(words, author="lab", message="words", configuration={})
         store.put_words(bytes(16), {node: np.array([3, 5, 700]) for node in first})
         session = next(iter(store.sessions))
         store.amend(session, {Amendable.ROBOT: "renamed"}, author="lab")

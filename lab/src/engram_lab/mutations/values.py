@@ -102,7 +102,7 @@ def landmarks(body: bytes, chance: random.Random) -> bytes:
         case 0:
             header = flipped(header, chance)
         case 1:
-            header = bent_json(header.decode(), chance).encode()
+            header = _bent_header(header.decode(), chance).encode()
         case 2:
             header = chance.choice([b"[" * _DEEP, b'{"a":' * _DEEP, b"{}", b""])
         case 3:
@@ -113,6 +113,16 @@ def landmarks(body: bytes, chance: random.Random) -> bytes:
             length = chance.choice([0, 2**31, 2**63, 2**64 - 1, length + 1])
             return length.to_bytes(8, "little") + header + arrays
     return len(header).to_bytes(8, "little") + header + arrays
+
+
+def _bent_header(header: str, chance: random.Random) -> str:
+    """The header with a wrong value in it, or in the JSON that its own metadata hold."""
+    about = json.loads(header).get("__metadata__", {})
+    within = [key for key, value in about.items() if value.startswith("{")]
+    if not within or chance.random() < 0.3:
+        return bent_json(header, chance)
+    about[within[0]] = bent_json(about[within[0]], chance)
+    return json.dumps(json.loads(header) | {"__metadata__": about})
 
 
 def picture(value: bytes, chance: random.Random) -> bytes:

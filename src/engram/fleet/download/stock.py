@@ -100,8 +100,8 @@ class Stock:
             listed = ", ".join(f"{one.robot} {str(one.id)[:8]}" for one in without[:_LISTED])
             raise InputError(
                 f"{_zones_told(without)}no node of {self.store.location} has a known hour of day: "
-                f"{len(without)} of {len(self.sessions)} sessions ({listed}…) have no UTC clock or neither longitude "
-                "nor time zone; set it with engram amend, or choose --select "
+                f"{len(without)} of {len(self.sessions)} sessions ({listed}…) have no UTC clock or "
+                "neither longitude nor time zone; set it with engram amend, or choose --select "
                 "copy, region or route"
             )
         return self.hours

@@ -11,12 +11,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, func, insert, select
 
-from engram.errors import MapCorruptError
+from engram.errors import MapCorruptError, SequenceError
 from engram.frontend.blobs import content_digest
 from engram.sequences.framelog.file import (
     decisions_table,
@@ -26,7 +25,7 @@ from engram.sequences.framelog.file import (
 )
 from engram.sequences.framelog.reader import read_header
 from engram.sequences.framelog.writer import FrameLogWriter
-from engram.sequences.images import header_size
+from engram.sequences.images import decoded, grey, header_size
 
 # Keys of the report: how many decisions, and images, belong to it.
 _FRAMES, _IMAGES = "frames", "images"
@@ -173,7 +172,7 @@ def _json(path: Path, row: Any) -> dict[str, Any]:
 def _decoded(path: Path, content: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
     if header_size(content) != size:
         raise MapCorruptError(f"{path}: an image is not {size[0]}×{size[1]} px")
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise MapCorruptError(f"{path}: an image cannot be decoded")
-    return np.asarray(image, np.uint8)
+    try:
+        return grey(path, decoded(path, content, size))
+    except SequenceError as error:
+        raise MapCorruptError(str(error)) from error
