@@ -159,6 +159,49 @@ def check_parent(path: Path) -> None:
         raise InputError(f"{path.parent} is not a folder; make it first")
 
 
+def check_output(path: Path) -> None:
+    """Refuse, before the work, a file that could not be written at its end.
+
+    Raises:
+        InputError: its folder is not there or cannot be written to, or it is no file of one's own.
+    """
+    try:
+        if path.is_dir():
+            raise InputError(f"{path} is a folder; give the name of a file in it")
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path} is a device or pipe; give the name of a file")
+        check_parent(path)
+        if path.exists() and not os.access(path, os.W_OK):
+            raise InputError(f"{path} cannot be written: it is read-only")
+        _try_folder(path.parent)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def check_output_folder(path: Path) -> None:
+    """Refuse, before the work, a folder that could not be made and filled at its end.
+
+    Raises:
+        InputError: something else has its name, or it cannot be written to.
+    """
+    try:
+        there = next(one for one in (path, *path.absolute().parents) if one.exists())
+        if not there.is_dir():
+            raise InputError(f"{path} cannot be a folder: {there} is a file")
+        _try_folder(there)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written to: {error.strerror}") from error
+
+
+def _try_folder(folder: Path) -> None:
+    """Makes a file without a name in a folder: permissions do not tell of all that forbids it.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    tempfile.TemporaryFile(dir=folder).close()
+
+
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
     """Yields where to write a file that appears under its name when the block ends.

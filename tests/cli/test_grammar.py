@@ -240,7 +240,7 @@ def test_plot_refuses_what_it_cannot_write(engram, street: Path, tmp_path: Path)
     for picture in ("no/folder/a.png", "a.xyz", "town"):
         ran = engram("plot", town, picture)
         assert ran.status == 2
-        assert picture in ran.err
+        assert picture.removesuffix("/a.png") in ran.err
 
 
 def test_map_says_what_became_of_every_frame_and_what_to_try_next(

@@ -25,7 +25,7 @@ def test_without_rerun_the_command_that_installs_it_is_named(
 
 def test_what_is_neither_window_nor_recording_is_refused() -> None:
     with pytest.raises(InputError, match=r"NAME\.rrd"):
-        viewer_for("street.png")
+        viewer_for(Path("street.png"))
 
 
 @pytest.mark.parametrize("verb", ["map", "localise", "live"])

@@ -10,6 +10,7 @@ import typer
 
 from engram.cli.centre_maps import dream, jobs, map_
 from engram.cli.centre_options import BY, NONE, Database, Folder, MapName, Objects, open_centre
+from engram.cli.outputs import output_folder
 from engram.errors import ConfigError
 
 
@@ -160,7 +161,9 @@ def sweep(folder: Folder, *, database: Database = None, objects: Objects = None)
 
 def backup(
     folder: Folder,
-    target: Annotated[Path, typer.Argument(metavar="TARGET", help="A new folder.")],
+    target: Annotated[
+        Path, typer.Argument(metavar="TARGET", help="A new folder.", parser=output_folder)
+    ],
     *,
     database: Database = None,
     objects: Objects = None,

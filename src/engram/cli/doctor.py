@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from engram.cli import options
+from engram.cli import options, outputs
 from engram.cli.endings import EXIT_UNFIT_DRIVE
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def doctor(
             "--pictures",
             metavar="DIR",
             help="Draw four pairs with what both sides show, and what moves with the camera.",
+            parser=outputs.output_folder,
         ),
     ] = None,
     settings: options.SettingsGiven,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from engram.cli import options
+from engram.cli import options, outputs
 from engram.cli.help import VerbInFull
 from engram.counts import counted
 
@@ -81,7 +81,10 @@ def calibration(
     picture: Annotated[
         Path | None,
         typer.Option(
-            "--picture", metavar="PNG", help="The picture [default: DRIVE-calibration.png]."
+            "--picture",
+            metavar="PNG",
+            help="The picture [default: DRIVE-calibration.png].",
+            parser=outputs.output_file,
         ),
     ] = None,
     as_json: options.Json = False,

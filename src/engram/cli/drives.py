@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from engram.cli import options
+from engram.cli import options, outputs
 from engram.cli.losses import losses_told
 from engram.errors import ConfigError
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def map_(
-    map_path: options.MapPath,
+    map_path: outputs.WrittenMap,
     path: options.DrivePath,
     *,
     drive: options.Drive,
@@ -29,7 +29,7 @@ def map_(
     force: Annotated[
         bool, typer.Option("--force", help="Map the drive even if the doctor finds it unfit.")
     ] = False,
-    view: options.View = None,
+    view: outputs.View = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
@@ -90,11 +90,21 @@ def localise(
     at: options.At = None,
     trajectory: Annotated[
         Path | None,
-        typer.Option("--trajectory", metavar="FILE", help="Write the trajectory in TUM format."),
+        typer.Option(
+            "--trajectory",
+            metavar="FILE",
+            help="Write the trajectory in TUM format.",
+            parser=outputs.output_file,
+        ),
     ] = None,
     pictures: Annotated[
         Path | None,
-        typer.Option("--pictures", metavar="DIR", help="Write about 20 pictures of matches."),
+        typer.Option(
+            "--pictures",
+            metavar="DIR",
+            help="Write about 20 pictures of matches.",
+            parser=outputs.output_folder,
+        ),
     ] = None,
     rate: Annotated[
         float | None,
@@ -106,10 +116,15 @@ def localise(
     ] = False,
     recorder: Annotated[
         Path | None,
-        typer.Option("--recorder", metavar="DIR", help="When lost, write the last 30 s to a file."),
+        typer.Option(
+            "--recorder",
+            metavar="DIR",
+            help="When lost, write the last 30 s to a file.",
+            parser=outputs.output_folder,
+        ),
     ] = None,
     no_images: Annotated[bool, typer.Option("--no-images", help="Record no images.")] = False,
-    view: options.View = None,
+    view: outputs.View = None,
     explain: Annotated[
         int | None,
         typer.Option(
@@ -147,14 +162,14 @@ def localise(
     sequence, resolved, tried = drive.open(path), given.of_robot(), effort.over(given)
     if explain is None:
         asked = RobotOptions(**tried, deadline_ms=deadline, relocaliser=found_by)
-        outputs = Outputs(
+        wanted = Outputs(
             trajectory, pictures, rate, as_json, remember, recorder, not no_images, view
         )
         with losses_told(sequence), open_map(map_path, at) as opened:
             _follow(opened, resolved)
             if not opened.node_count():
                 typer.echo(_empty(opened), err=True)
-            localise_and_print(opened, sequence, resolved, asked, outputs)
+            localise_and_print(opened, sequence, resolved, asked, wanted)
         return
     refused = {
         "--trajectory": trajectory, "--pictures": pictures, "--rate": rate, "--deadline": deadline,
@@ -168,7 +183,12 @@ def localise(
 
 def record(
     path: options.DrivePath,
-    out: Annotated[Path, typer.Argument(metavar="LOG", help="The frame log, NAME.framelog.")],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LOG", help="The frame log, NAME.framelog.", parser=outputs.output_file
+        ),
+    ],
     *,
     drive: options.Drive,
     descriptor: options.Descriptor = None,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from engram.cli import options
+from engram.cli import options, outputs
 from engram.cli.endings import PartlyDoneError, VerbInterruptedError
 from engram.cli.history import AUTHOR
 from engram.errors import ConfigError, EngramError
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def merge(
-    centre: options.FleetMap,
+    centre: outputs.WrittenFleetMap,
     robots: Annotated[
         list[Path],
         typer.Argument(
@@ -47,7 +47,12 @@ def merge(
     ] = False,
     picture: Annotated[
         Path | None,
-        typer.Option("--picture", metavar="FILE", help="Draw the fleet map before and after."),
+        typer.Option(
+            "--picture",
+            metavar="FILE",
+            help="Draw the fleet map before and after.",
+            parser=outputs.output_picture,
+        ),
     ] = None,
     geometry: Annotated[
         bool, typer.Option("--geometry", help="Count the wrong edges of each result.")
@@ -137,7 +142,7 @@ def download(
         typer.Argument(
             metavar="OUT",
             help="The robot's map: a new file, or with --update its own.",
-            parser=options.map_file,
+            parser=outputs.output_map,
         ),
     ],
     *,
@@ -248,7 +253,7 @@ def download(
 
 
 def build(
-    centre: options.FleetMap,
+    centre: outputs.WrittenFleetMap,
     drives: Annotated[
         list[str], typer.Argument(metavar="DRIVE", help="Frame logs or drives: paths or URLs.")
     ],

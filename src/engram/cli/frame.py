@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from engram.cli import options
+from engram.cli import options, outputs
 from engram.cli.progress import Bars
 from engram.cli.wording import undo_text
 from engram.counts import counted
@@ -180,7 +180,12 @@ def _goal_text(one: dict[str, object]) -> str:
 def export(
     map_path: options.MapPath,
     out: Annotated[
-        Path, typer.Argument(metavar="FILE", help="NAME.tum, .kitti, .csv or .geojson.")
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="NAME.tum, .kitti, .csv or .geojson.",
+            parser=outputs.output_file,
+        ),
     ],
     *,
     form: Annotated[

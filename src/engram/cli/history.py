@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from engram.cli import options
+from engram.cli import options, outputs
 from engram.cli.wording import undo_text
 from engram.errors import ConfigError, RevisionError
 
@@ -104,7 +104,13 @@ def diff(
         float, typer.Option("--stretch", metavar="M", help="Length of the listed stretches.")
     ] = 50.0,
     picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE", help="Draw what changed.")
+        Path | None,
+        typer.Option(
+            "--picture",
+            metavar="FILE",
+            help="Draw what changed.",
+            parser=outputs.output_picture,
+        ),
     ] = None,
     as_json: options.Json = False,
 ) -> None:

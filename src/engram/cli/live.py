@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from engram.cli import options
+from engram.cli import options, outputs
 from engram.cli.endings import VerbInterruptedError
 from engram.errors import ConfigError
 
@@ -49,7 +49,7 @@ def live(
             "--deadline", metavar="MS", help="Start no attempt later than this after the frame."
         ),
     ] = None,
-    view: options.View = None,
+    view: outputs.View = None,
     settings: options.SettingsGiven,
 ) -> None:
     """Localise while a robot drives.

@@ -44,7 +44,7 @@ class Outputs:
     remember: bool = False
     recorder: Path | None = None
     record_images: bool = True
-    view: str | None = None
+    view: Path | None = None
 
 
 def localise_and_print(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from engram.cli import options
+from engram.cli import options, outputs
 from engram.cli.wording import undo_text
 from engram.counts import counted
 
@@ -81,7 +81,12 @@ def info(
 
 def plot(
     map_path: options.MapPath,
-    out: Annotated[Path, typer.Argument(metavar="FILE", help="The picture: .png, .svg, .pdf.")],
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="The picture: .png, .svg, .pdf.", parser=outputs.output_picture
+        ),
+    ],
     *,
     by: Annotated[
         PlotBy,
@@ -126,7 +131,12 @@ def check(
     yes: Annotated[bool, typer.Option("--yes", help="Commit the repair.")] = False,
     pictures: Annotated[
         Path | None,
-        typer.Option("--pictures", metavar="DIR", help="Draw both sides of those edges."),
+        typer.Option(
+            "--pictures",
+            metavar="DIR",
+            help="Draw both sides of those edges.",
+            parser=outputs.output_folder,
+        ),
     ] = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,

@@ -43,12 +43,6 @@ def _british(word: str) -> str:
 MapPath: TypeAlias = Annotated[
     Path, typer.Argument(metavar="MAP", help="A map, NAME.engram.", parser=map_file)
 ]
-FleetMap: TypeAlias = Annotated[
-    Path,
-    typer.Argument(
-        metavar="FLEET", help="The fleet map; created if it does not exist.", parser=map_file
-    ),
-]
 DrivePath: TypeAlias = Annotated[
     Path,
     typer.Argument(metavar="DRIVE", help="A folder of stereo images, a ROS bag or a frame log."),
@@ -86,12 +80,6 @@ Descriptor: TypeAlias = Annotated[
 ]
 NoThumbnails: TypeAlias = Annotated[
     bool, typer.Option("--no-thumbnails", help="Store no small pictures with the nodes.")
-]
-View: TypeAlias = Annotated[
-    str | None,
-    typer.Option(
-        "--view", metavar="window|FILE.rrd", help="Watch it in Rerun, or write a recording."
-    ),
 ]
 Settings: TypeAlias = Annotated[
     Path | None,

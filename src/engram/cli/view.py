@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from engram.cli import options
+from engram.cli import options, outputs
 
 
 def view(
@@ -19,7 +19,10 @@ def view(
     save: Annotated[
         Path | None,
         typer.Option(
-            "--save", metavar="FILE.rrd", help="Write a recording instead of opening a window."
+            "--save",
+            metavar="FILE.rrd",
+            help="Write a recording instead of opening a window.",
+            parser=outputs.output_file,
         ),
     ] = None,
     at: options.At = None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
+from engram.files import check_output
 from engram.untrusted import printable
 from engram.viewing.canvas import matplotlib_for_files, save, subplots
 
@@ -107,13 +107,10 @@ def check_picture(path: Path) -> None:
         InputError: the folder does not exist or is not writable, or the file extension is unknown.
         MissingExtraError: Matplotlib is not installed.
     """
+    check_output(path)
     formats = matplotlib_for_files().figure.Figure().canvas.get_supported_filetypes()
     ending = path.suffix.removeprefix(".").lower()
-    if not path.parent.is_dir():
-        raise InputError(f"the picture {path} cannot be written: {path.parent} is not a folder")
     if ending not in formats:  # Matplotlib would write another file, NAME.png
         raise InputError(
             f"the picture {path} cannot be written: .{ending} is not one of {', '.join(formats)}"
         )
-    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise InputError(f"the picture {path} cannot be written: permission denied, or a folder")

@@ -144,7 +144,7 @@ class Viewer:
         self._stream.log(f"map/driven/{part}", strip)
 
 
-def viewer_for(view: str | None) -> Viewer | nullcontext[None]:
+def viewer_for(view: Path | None) -> Viewer | nullcontext[None]:
     """The viewer of an option ``--view``: a window, a recording, or none.
 
     Raises:
@@ -152,11 +152,11 @@ def viewer_for(view: str | None) -> Viewer | nullcontext[None]:
     """
     if view is None:
         return nullcontext()
-    if view == "window":
+    if view == Path("window"):
         return Viewer()
-    if not view.endswith(".rrd"):
+    if view.suffix != ".rrd":
         raise InputError(f"--view {view}: give window, or a file to write, NAME.rrd")
-    return Viewer(Path(view))
+    return Viewer(view)
 
 
 def _rerun() -> Any:
