@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 from pathlib import Path
 
@@ -9,9 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
+from engram.cli.endings import ExitStatus
 from engram.maps import open_map
 
 UNFIT, EXIT_DAMAGED = 4, 3
+NOT_TO_BE_TRUSTED = 5
 
 
 @pytest.fixture
@@ -123,3 +127,69 @@ def test_an_unfit_drive_is_mapped_only_by_force_and_the_revision_says_so(
         (revision,) = town.log()
     assert revision.message.endswith("(forced: sides_swapped)")
     assert revision.configuration["doctor"]["fatal"]
+
+
+def test_what_is_localised_of_an_unfit_drive_is_not_to_be_trusted(
+    engram, street: Path, swapped: Path, tmp_path: Path
+) -> None:
+    town = tmp_path / "town.engram"
+    engram("map", town, street)
+    assert engram("localise", town, street, "--json").json["summary"]["trusted"]
+    ran = engram("localise", town, swapped, "--json")
+    assert ran.status == NOT_TO_BE_TRUSTED
+    assert ran.json["summary"]["trusted"] is False
+    assert len(ran.json["frames"]) == 12
+    assert "not to be trusted: fatal: sides_swapped" in ran.err
+    told = engram("localise", town, swapped)
+    assert "next: correct the drive (sides_swapped" in told.out
+
+
+def test_what_is_recorded_of_an_unfit_drive_is_kept_and_said_not_to_be_trusted(
+    engram, swapped: Path, tmp_path: Path
+) -> None:
+    log = tmp_path / "drive.framelog"
+    ran = engram("record", swapped, log, "--json")
+    assert ran.status == NOT_TO_BE_TRUSTED
+    assert ran.json["findings"][0]["code"] == "sides_swapped"
+    assert ran.json["frames"] == 12
+    assert "not to be trusted: fatal: sides_swapped" in ran.err
+    assert log.exists()
+
+
+def test_a_live_robot_with_an_unfit_drive_says_so_and_commits_nothing(
+    engram, street: Path, swapped: Path, tmp_path: Path
+) -> None:
+    town = tmp_path / "town.engram"
+    engram("map", town, street)
+    ran = engram("live", town, "--play", swapped, "--map", "--set", "doctor.frames=8")
+    assert ran.status == NOT_TO_BE_TRUSTED
+    said = [json.loads(line) for line in ran.out.splitlines()]
+    seen = [one for one in said if one["is"] == "seen"]
+    assert not any("right" in one["trouble"] for one in seen[:7])
+    assert all(one["trouble"] for one in seen[8:])
+    (ended,) = [one for one in said if one["is"] == "ended"]
+    assert ended["unfit"][0] == "sides_swapped"
+    assert ended["saving"] == "uncommitted"
+    with open_map(town) as store:
+        assert store.revision == 1
+
+
+def test_a_live_robot_that_keeps_nothing_says_that_it_is_not_to_be_trusted(
+    engram, street: Path, swapped: Path, tmp_path: Path
+) -> None:
+    town = tmp_path / "town.engram"
+    engram("map", town, street)
+    ran = engram("live", town, "--play", swapped, "--set", "doctor.frames=8")
+    assert ran.status == NOT_TO_BE_TRUSTED
+    seen = [one for one in map(json.loads, ran.out.splitlines()) if one["is"] == "seen"]
+    assert seen[-1]["trouble"].startswith("not to be trusted: ")
+    sound = engram("live", town, "--play", street)
+    assert sound.status == 0
+
+
+def test_the_statuses_are_those_of_the_documentation() -> None:
+    table = (Path(__file__).parents[2] / "docs" / "commands.md").read_text()
+    rows = re.findall(r"^\| (\d+) \| (.*) \|$", table, re.M)
+    assert [(int(value), meaning) for value, meaning in rows] == [
+        (int(one), one.meaning) for one in ExitStatus
+    ]

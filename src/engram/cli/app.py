@@ -10,7 +10,7 @@ from typing import Annotated, Any, cast
 import typer
 
 from engram import __version__
-from engram.cli.endings import EXIT_UNFIT_DRIVE, PartlyDoneError, VerbInterruptedError
+from engram.cli.endings import ExitStatus, PartlyDoneError, VerbInterruptedError
 from engram.cli.moved import moved_option
 from engram.cli.screen import UnwritableError, forget, screen
 from engram.cli.verbs import Program, register
@@ -50,10 +50,6 @@ register(app)
 _DEMO = ", or engram demo" if any(one.name == "demo" for one in app.registered_commands) else ""
 app.info.epilog = f"Start with: engram map street.engram DRIVE{_DEMO}"
 
-EXIT_BAD_INPUT = 2
-EXIT_INTERRUPTED = 130
-EXIT_READER_LEFT = 141  # as of a program that SIGPIPE ends: `| head -1` is no fault
-
 # What Typer raises for any mistyped command line; of its kinds it exports only this one's child.
 _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
 
@@ -66,9 +62,9 @@ def main() -> None:
     except UnwritableError as error:
         forget(sys.stdout)
         if error.reader_left:
-            sys.exit(EXIT_READER_LEFT)
+            sys.exit(ExitStatus.READER_LEFT)
         print(f"engram: {error}", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+        sys.exit(ExitStatus.BAD_INPUT)
 
 
 def _run() -> None:
@@ -77,13 +73,13 @@ def _run() -> None:
     except _UsageError as error:  # a verb or option that is mistyped
         if answer := _moved(error):
             _complain(InputError(answer))
-            sys.exit(EXIT_BAD_INPUT)
+            sys.exit(ExitStatus.BAD_INPUT)
         _tell_machines(error.format_message(), type(error).__name__)
         error.show()
         sys.exit(error.exit_code)
     except typer.Abort:
         _complain(VerbInterruptedError("interrupted"))
-        sys.exit(EXIT_INTERRUPTED)
+        sys.exit(ExitStatus.INTERRUPTED)
     except PartlyDoneError as partly:
         _complain(partly.error, partly.done)
         sys.exit(_status_of(partly.error))
@@ -99,7 +95,7 @@ def _run() -> None:
                 "again with make setup or pip install ."
             )
         )
-        sys.exit(EXIT_BAD_INPUT)
+        sys.exit(ExitStatus.BAD_INPUT)
     sys.exit(code)
 
 
@@ -113,8 +109,8 @@ def _moved(error: Any) -> str | None:
 
 def _status_of(error: EngramError | VerbInterruptedError) -> int:
     if isinstance(error, VerbInterruptedError):
-        return EXIT_INTERRUPTED
-    return EXIT_UNFIT_DRIVE if isinstance(error, UnfitDriveError) else EXIT_BAD_INPUT
+        return ExitStatus.INTERRUPTED
+    return ExitStatus.UNFIT_DRIVE if isinstance(error, UnfitDriveError) else ExitStatus.BAD_INPUT
 
 
 def _complain(error: Exception, done: Mapping[str, Any] | None = None) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from engram.cli import options, outputs
-from engram.cli.endings import EXIT_UNFIT_DRIVE
+from engram.cli.endings import ExitStatus
 
 if TYPE_CHECKING:
     import numpy as np
@@ -78,7 +78,7 @@ def doctor(
             _draw_fixed(pictures, pairs, diagnosis, getattr(sequence, "cameras", None))
         print(json.dumps(diagnosis.to_dict()) if as_json else diagnosis.text())
         if diagnosis.fatal:
-            raise typer.Exit(EXIT_UNFIT_DRIVE)
+            raise typer.Exit(ExitStatus.UNFIT_DRIVE)
 
 
 def _draw(folder: Path, pairs: list[StereoPair]) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from engram.cli import options, outputs
+from engram.cli.endings import ExitStatus, untrusted_if
 from engram.cli.losses import losses_told
 from engram.errors import ConfigError
 
@@ -71,7 +72,7 @@ def map_(
                 typer.echo(warning, err=True)
             typer.echo(mapped_text(report.to_dict(), map_path))
         if report.interrupted:
-            raise typer.Exit(130)
+            raise typer.Exit(ExitStatus.INTERRUPTED)
 
 
 def localise(
@@ -140,8 +141,9 @@ def localise(
     """Find a drive in a map.
 
     The map is not changed, unless --remember keeps the drive's path and match attempts, which rank
-    candidates for later drives. --explain localises the drive up to one frame, then lists that
-    frame's candidates: why they are in this order, and which of them match.
+    candidates for later drives. If the drive has a fatal fault (see engram doctor), the result is
+    not to be trusted, and the exit status is 5. --explain localises the drive up to one frame, then
+    lists that frame's candidates: why they are in this order, and which of them match.
 
     \b
     Examples:
@@ -198,7 +200,8 @@ def record(
     """Store a drive compactly, as a frame log.
 
     A frame log keeps features and odometry in a sixteenth of the space of the images. Every verb
-    reads it like the drive itself. The same command resumes an interrupted recording.
+    reads it like the drive itself. The same command resumes an interrupted recording. The log of a
+    drive with a fatal fault is kept, and the exit status is 5: engram map refuses its images.
 
     \b
     Examples:
@@ -217,7 +220,9 @@ def record(
         else:
             typer.echo(report.text())
         if report.interrupted:
-            raise typer.Exit(130)
+            raise typer.Exit(ExitStatus.INTERRUPTED)
+        if report.diagnosis is not None:
+            untrusted_if(report.diagnosis.fatal)
 
 
 def _asked_kind(settings: Settings) -> str | None:

@@ -2,13 +2,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any
+
+import typer
 
 from engram.errors import EngramError
 
-# A drive has a fatal fault.
-EXIT_UNFIT_DRIVE = 4
+if TYPE_CHECKING:
+    from engram.doctor.findings import Finding
+
+
+class ExitStatus(IntEnum):
+    """How a verb ended, for scripts. `docs/commands.md` has the same table."""
+
+    meaning: str
+
+    def __new__(cls, value: int, meaning: str) -> ExitStatus:
+        """A status with what it means."""
+        one = int.__new__(cls, value)
+        one._value_ = value
+        one.meaning = meaning
+        return one
+
+    DONE = 0, "done"
+    DAMAGED_MAP = 1, "`check` found damage, or wrong edges"
+    BAD_INPUT = 2, "the input cannot be used; one line says why and what to do"
+    LOST_PARTS = 3, "parts of a bag were lost; the rest was used"
+    UNFIT_DRIVE = 4, "the drive has a fatal fault: `doctor` found it, or `map` refused it"
+    NOT_TO_BE_TRUSTED = (
+        5,
+        "`localise`, `live`, `record` and `view` did it, but the drive has a fatal fault: do not "
+        "trust the result",
+    )
+    INTERRUPTED = 130, "interrupted"
+    READER_LEFT = 141, "nobody reads the output"  # as of a program that SIGPIPE ends
+
+
+def untrusted_if(fatal: Sequence[Finding]) -> None:
+    """Ends a verb that did what was asked with a drive that is unfit for it.
+
+    Raises:
+        Exit: the doctor found something fatal; stderr says what.
+    """
+    if not fatal:
+        return
+    for one in fatal:
+        typer.echo(f"not to be trusted: {one.text()}", err=True)
+    raise typer.Exit(ExitStatus.NOT_TO_BE_TRUSTED)
 
 
 class VerbInterruptedError(Exception):

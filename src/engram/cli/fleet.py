@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from engram.cli import options, outputs
-from engram.cli.endings import PartlyDoneError, VerbInterruptedError
+from engram.cli.endings import ExitStatus, PartlyDoneError, VerbInterruptedError
 from engram.cli.history import AUTHOR
 from engram.errors import ConfigError, EngramError
 
@@ -118,7 +118,7 @@ def merge(
     if as_json:
         print(json.dumps(_merges(reports)))
     if any(report.interrupted for report in reports):
-        raise typer.Exit(130)
+        raise typer.Exit(ExitStatus.INTERRUPTED)
 
 
 def _merges(reports: list[MergeReport]) -> dict[str, Any]:
@@ -344,7 +344,7 @@ def build(
     else:
         typer.echo(report.text() if looked is None else f"{report.text()}\n{looked.text()}")
     if report.interrupted:
-        raise typer.Exit(130)
+        raise typer.Exit(ExitStatus.INTERRUPTED)
 
 
 def _grouping(text: str) -> tuple[str, int]:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from engram.cli import options, outputs
-from engram.cli.endings import VerbInterruptedError
+from engram.cli.endings import VerbInterruptedError, untrusted_if
 from engram.errors import ConfigError
 
 
@@ -91,6 +91,7 @@ def live(
         except KeyboardInterrupt:
             told = f"interrupted; {process.saving.text()}"
             raise VerbInterruptedError(told) from None
+    untrusted_if(process.unfit)
 
 
 def _print(message: dict[str, Any]) -> None:

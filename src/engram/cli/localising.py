@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from engram.cli.endings import ExitStatus, untrusted_if
 from engram.errors import InputError
 
 if TYPE_CHECKING:
@@ -91,12 +92,14 @@ def localise_and_print(
                 typer.echo("interrupted: the summary covers the frames so far", err=True)
         if outputs.trajectory is not None:
             write_trajectory(outputs.trajectory, opened.graph, results)
+    fatal = robot.diagnosis.fatal
     summary = {
         **summarise(results),
         "skipped_pairs": sequence.skipped,
         "wrong_stamps": stamps_of(sequence).left_out,
         "interrupted": interrupted,
         "findings": robot.diagnosis.to_dict()["findings"],
+        "trusted": not fatal,
     }
     if outputs.remember:
         summary["remembered"] = {"state": robot.saving.state, "revision": robot.saving.revision}
@@ -111,7 +114,8 @@ def localise_and_print(
         if outputs.remember:
             typer.echo(robot.saving.text())
     if interrupted:
-        raise typer.Exit(130)
+        raise typer.Exit(ExitStatus.INTERRUPTED)
+    untrusted_if(fatal)
 
 
 def _recorder(opened: Map, sequence: Drive, outputs: Outputs) -> Recorder | None:

@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from engram.cli.endings import VerbInterruptedError
+from engram.cli.endings import ExitStatus, VerbInterruptedError
 from engram.errors import EngramError
 
 if TYPE_CHECKING:
     from engram.sequences import Drive
-
-EXIT_DAMAGED = 3
 
 
 @contextmanager
@@ -34,7 +32,7 @@ def losses_told(sequence: Drive) -> Iterator[None]:
         _told(sequence, "parts of the bag could not be read:")
         raise
     if _told(sequence, "parts of the bag could not be read; the rest was used:"):
-        raise typer.Exit(EXIT_DAMAGED)
+        raise typer.Exit(ExitStatus.LOST_PARTS)
 
 
 def _noted(sequence: Drive) -> None:

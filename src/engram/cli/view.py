@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from engram.cli import options, outputs
+from engram.cli.endings import untrusted_if
 
 
 def view(
@@ -58,5 +59,7 @@ def view(
                 viewer.watch(robot, opened)
                 for _ in robot.drive(sequence, monitor):
                     pass
+        unfit = () if path is None else robot.unfit
     if save is not None:
         typer.echo(f"wrote {save}; open it with: rerun {save}")
+    untrusted_if(unfit)

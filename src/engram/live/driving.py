@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
+from engram.doctor.findings import Finding
 from engram.errors import EngramError, InputError
 from engram.frontend import DescriptorKind, StereoPair
 from engram.geometry import SE3, StereoCamera
@@ -116,6 +117,8 @@ class Driving:
         self.options = options
         self._watcher = watcher
         self.trouble = ""
+        # Of the drives so far: why what was said is not to be trusted.
+        self.unfit: tuple[Finding, ...] = ()
         self._now = now
         self._camera: StereoCamera | None = None
         self._front: tuple[DescriptorKind, Front] | None = None
@@ -171,7 +174,8 @@ class Driving:
         map_from_live = None if self._whereabouts is None else self._whereabouts.after(found)
         if found.status is LocalisationStatus.LOCALISED or found.position is None or found.saved:
             self._proposed = False
-        self.trouble = robot.saving.reason if robot.saving.state in _KEEPS_NO_MORE else ""
+        keeps_no_more = robot.saving.state in _KEEPS_NO_MORE
+        self.trouble = robot.saving.reason if keeps_no_more else _untrusted(robot.unfit)
         clock = front.clock
         trouble = self.trouble or _stamp_trouble(clock, frame.stamp_ns, steps)
         place = map_from_live, self._proposed, clock.expected_ns, clock.newest_waits
@@ -268,6 +272,7 @@ class Driving:
         except EngramError as error:
             self.trouble = str(error)
         finally:
+            self.unfit = self.unfit or robot.unfit
             self._saved = robot.saving
             with suppress(EngramError):  # the drive is what counts, and it is committed or reported
                 opened.close()
@@ -343,3 +348,8 @@ def _stamp_trouble(clock: SteadyClock, stamp_ns: int, steps: int) -> str:
 def _vague(position: Position) -> Position:
     doubt = np.diag(np.repeat([_KEPT_SIGMA_M**2, _KEPT_SIGMA_RAD**2], 3))
     return Position(position.node, position.node_from_live, position.covariance + doubt)
+
+
+def _untrusted(unfit: Sequence[Finding]) -> str:
+    """What is said of a drive with these fatal findings."""
+    return "" if not unfit else "not to be trusted: " + "; ".join(one.message for one in unfit)

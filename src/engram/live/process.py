@@ -15,6 +15,7 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.doctor.findings import Finding
 from engram.errors import EngramError, InputError
 from engram.frontend import StereoPair
 from engram.geometry import SE3
@@ -91,6 +92,11 @@ class LiveProcess:
         """Whether and where the drive is saved."""
         return self._driving.saving
 
+    @property
+    def unfit(self) -> tuple[Finding, ...]:
+        """Fatal findings about the drives that ended: why what was said is not to be trusted."""
+        return self._driving.unfit
+
     def run(self) -> None:
         """Serves frames and commands; on leaving, what was mapped is committed."""
         ended = Event()
@@ -106,7 +112,8 @@ class LiveProcess:
             said = self._driving.pause()
             ended.set()
             pulse.join()
-            self._transport.tell({"is": "ended", "text": said, **self._saving()})
+            unfit = [one.code for one in self.unfit]
+            self._transport.tell({"is": "ended", "text": said, "unfit": unfit, **self._saving()})
 
     def _take(self, event: FrameEvent) -> None:
         step = self._driving.step(event.arrived, event.arrived_s, event.outside)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from engram.config import config_hash
 from engram.counts import counted
+from engram.doctor.findings import Diagnosis
 from engram.errors import SequenceError
 from engram.frontend import Frame, FrameStatus
 from engram.monitor import QUIET, Monitor, deferred_interrupt
@@ -38,6 +39,7 @@ class ExtractReport:
         skipped: pairs left out under `skip_bad`.
         bytes: size of the file.
         interrupted: whether the run was stopped; the same command continues it.
+        diagnosis: what the doctor found in the first frames; a log holds no images for it to see.
     """
 
     log: str
@@ -48,10 +50,14 @@ class ExtractReport:
     skipped: int = 0
     bytes: int = 0
     interrupted: bool = False
+    diagnosis: Diagnosis | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """What ``extract --json`` prints."""
-        return asdict(self)
+        """What ``record --json`` prints."""
+        findings = [] if self.diagnosis is None else self.diagnosis.to_dict()["findings"]
+        values = asdict(replace(self, diagnosis=None))
+        del values["diagnosis"]
+        return {**values, "findings": findings}
 
     def text(self) -> str:
         """For people."""
@@ -119,6 +125,7 @@ def extract_log(
     finally:
         if writer is not None:
             writer.close()  # also after an error or an interruption: progress is kept
+    report.diagnosis = front.diagnosis
     report.skipped = sequence.skipped
     report.bytes = out.stat().st_size if out.exists() else 0
     return report

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Self
 
 from engram.doctor import Diagnosis
+from engram.doctor.findings import Finding
 from engram.errors import ConfigError, InputError, MapError
 from engram.frontend import Frame
 from engram.geometry import SE3, propagate_covariance
@@ -92,6 +93,8 @@ class Robot:
         deadline_ms: float | None = None,
     ) -> None:
         self.last: Seen | None = None
+        # Why nothing that the robot says is to be trusted, once the doctor has seen enough frames.
+        self.unfit: tuple[Finding, ...] = ()
         self._keeper = keeper
         self._live = live
         self._front = front
@@ -125,9 +128,10 @@ class Robot:
         """
         self._closed = True
         live, self._live = self._live, None
+        self.unfit = self.diagnosis.fatal
         try:
             if live is not None:
-                live.close(self.diagnosis.fatal)
+                live.close(self.unfit)
         finally:
             self._localiser.close()
             if self.recorder is not None:
@@ -385,7 +389,7 @@ class Robot:
     ) -> tuple[Frame, Motion]:
         """Frame and motion; once the doctor has seen enough, an unfit drive is kept no longer."""
         examination = self._front.examination
-        waits = self._live is not None and not examination.full
+        waits = not examination.full
         behind, self._behind = self._behind, None
         if behind is not None:
             since = _since_placed(behind, arrived, motion)
@@ -394,8 +398,10 @@ class Robot:
             elif since is not None and isinstance(arrived, LoggedFrame):
                 arrived = replace(arrived, odometry=since)
         taken = self._front.take(arrived, motion, clock)
-        if self._live is not None and waits and examination.full:
-            self._keeper = self._live.examined(self.diagnosis.fatal, self._keeper)
+        if waits and examination.full:
+            self.unfit = self.diagnosis.fatal
+            if self._live is not None:
+                self._keeper = self._live.examined(self.unfit, self._keeper)
         return taken
 
     def _known(self, frame: Frame, motion: Motion) -> Localisation | None:
