@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -128,8 +127,6 @@ def _recorder(opened: Map, sequence: Drive, outputs: Outputs) -> Recorder | None
         outputs.recorder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{outputs.recorder}: cannot be created: {error.strerror}") from error
-    if not os.access(outputs.recorder, os.W_OK):
-        raise InputError(f"{outputs.recorder}: cannot be written to: permission denied")
     about = {"map": str(opened.location), "revision": opened.revision}
     return Recorder(outputs.recorder, sequence.info, about, outputs.record_images)
 
