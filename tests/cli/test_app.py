@@ -74,7 +74,7 @@ def test_a_centre_where_no_folder_can_be_is_told_in_one_line(engram, tmp_path) -
     engram("centre", "map", tmp_path / "town", "fleet")
     ran = engram("centre", "backup", tmp_path / "town", tmp_path / "file" / "backup")
     assert ran.status == 2
-    assert "cannot hold a backup" in ran.err
+    assert "cannot be a folder" in ran.err
     ran = engram("centre", "jobs", tmp_path / "town", "--map", "flet")
     assert ran.status == 2
     assert "there is no map 'flet'" in ran.err

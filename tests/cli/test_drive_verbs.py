@@ -147,7 +147,7 @@ def test_a_recorder_that_cannot_write_is_refused_before_the_drive(
     assert engram("map", path, street, "--frames", "0:3").status == 0
     ran = engram("localise", path, street, "--frames", "0:3", "--recorder", path / "records")
     assert ran.status == 2
-    assert "records: cannot be created" in ran.err
+    assert "records cannot be a folder" in ran.err
 
 
 def test_the_list_of_features_says_what_each_is_good_at(engram) -> None:

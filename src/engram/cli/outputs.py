@@ -13,6 +13,10 @@ from engram.errors import EngramError
 from engram.files import check_output, check_output_folder
 
 
+class OutputError(EngramError):
+    """Nothing can be written where a verb was told to write."""
+
+
 def _refusing(check: Callable[[str], Path]) -> Callable[[str], Path]:
     """The check as the parser of an argument or option."""
 
@@ -20,7 +24,8 @@ def _refusing(check: Callable[[str], Path]) -> Callable[[str], Path]:
         try:
             return check(text)
         except EngramError as error:
-            raise typer.BadParameter(str(error)) from error
+            # No ValueError: Typer would make a page of usage of it.
+            raise OutputError(str(error)) from error
 
     return parse
 
