@@ -35,6 +35,7 @@ def state_of(site, row: dict) -> tuple[str, str | None]:
 
 
 def end_by_signal(pipe, folder, addresses, settings, key) -> None:
+    (folder / "work" / f"{key}.engram").write_bytes(b"half a map")
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -65,6 +66,7 @@ def test_what_kills_its_process_is_not_taken_again_without_an_operator(site, mon
         assert error == (
             f"the process that merged it ended {how}; an operator may have it merged anyway"
         )
+        assert list((site.centre.folder / "work").iterdir()) == []
         assert work_off(site.centre) == 0
         HandIns(site.centre).merge_anyway(HandIns(site.centre).get(killer["id"]), "operator")
         assert work_off(site.centre) == 1

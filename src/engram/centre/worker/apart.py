@@ -19,7 +19,7 @@ from engram.centre.handins import HandIns
 from engram.centre.keeping import HandInState
 from engram.centre.service import Centre
 from engram.centre.settings import CentreSettings
-from engram.centre.worker.merging import WaitsError, merge_hand_in
+from engram.centre.worker.merging import WaitsError, clear_scratch, merge_hand_in
 from engram.errors import EngramError
 from engram.logs import logging_to_stderr
 from engram.processes import end_with_parent
@@ -71,6 +71,7 @@ def _end_killer(centre: Centre, row: dict[str, Any], process: BaseProcess) -> No
     how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
     fact = f"the process that merged it ended {how}; an operator may have it merged anyway"
     _log.error("%s: hand-in %s: %s", row["map"], row["id"][:8], fact)
+    clear_scratch(centre, row)
     HandIns(centre).end(row, HandInState.FAILED, error=fact)
 
 

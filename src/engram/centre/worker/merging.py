@@ -54,11 +54,12 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
     if row["tries"] >= centre.settings.merge_tries:
         tries = counted(row["tries"], "time")
         fact = f"its worker died {tries}; an operator may have it merged anyway"
+        clear_scratch(centre, row)
         handins.end(row, HandInState.FAILED, error=fact)
         return
     handins.begun(row)
     begun_s = time.monotonic()
-    thin = centre.folder / "work" / f"{row['id']}.engram"
+    thin = _thin_map(centre, row)
     try:
         with _scratch(thin):
             _admit(centre, row, thin)
@@ -139,16 +140,25 @@ def _revision_of(path: Path, content_hash: str) -> int:
         return store.revision
 
 
+def clear_scratch(centre: Centre, row: dict[str, Any]) -> None:
+    """Takes away what the merge of a hand-in leaves beside the maps if it dies."""
+    _clear(_thin_map(centre, row))
+
+
+def _thin_map(centre: Centre, row: dict[str, Any]) -> Path:
+    return centre.folder / "work" / f"{row['id']}.engram"
+
+
 @contextmanager
 def _scratch(path: Path) -> Iterator[None]:
     """Takes away what a file and its locks leave, before and after."""
-
-    def clear() -> None:
-        for one in path.parent.glob(f"{path.name}*"):
-            one.unlink()
-
-    clear()
+    _clear(path)
     try:
         yield
     finally:
-        clear()
+        _clear(path)
+
+
+def _clear(path: Path) -> None:
+    for one in path.parent.glob(f"{path.name}*"):
+        one.unlink()
