@@ -29,7 +29,7 @@ class ExitStatus(IntEnum):
     DONE = 0, "done"
     DAMAGED_MAP = 1, "`check` found damage, or wrong edges"
     BAD_INPUT = 2, "the input cannot be used; one line says why and what to do"
-    LOST_PARTS = 3, "parts of a bag were lost; the rest was used"
+    LOST_PARTS = 3, "parts of a drive were lost, by damage or wrong stamps; the rest was used"
     UNFIT_DRIVE = 4, "the drive has a fatal fault: `doctor` found it, or `map` refused it"
     NOT_TO_BE_TRUSTED = (
         5,
