@@ -303,7 +303,10 @@ def test_a_gyroscope_turns_the_robot_where_the_camera_sees_nothing(
         for number in range(35):
             dark = number >= 30
             noise = rng.integers(0, 2, pair.left.shape, np.uint8)
-            left, right = (noise if dark else np.maximum(x, noise) for x in (pair.left, pair.right))
+            left, right = (
+                noise if dark else np.clip(x + rng.normal(0, 1.5, x.shape), 0, 255).astype(np.uint8)
+                for x in (pair.left, pair.right)
+            )
             stamp_ns = pair.stamp_ns + number * 10**8
             turn = turn @ SE3.exp(0.1 * np.r_[np.zeros(3), bias + dark * rate])
             moved = {"gyro_from_live": turn.rotation.ravel().tolist()}

@@ -194,7 +194,7 @@ class OutsideModel:
             self._m_per_s = None
             return
         self._watch(motion)
-        corrected = self._corrected(motion)
+        corrected = self.corrected(motion)
         self._since = corrected if self._since is None else _joined(self._since, corrected)
 
     def _watch(self, motion: OutsideMotion) -> None:
@@ -359,8 +359,11 @@ class OutsideModel:
             off = since.rates_rad_s - turned / seconds - self._bias
             self._bias = self._bias + share * off
 
-    def _corrected(self, motion: OutsideMotion) -> OutsideMotion:
-        """Without the gyroscope's bias: it turns the way by half of what it turns the end."""
+    def corrected(self, motion: OutsideMotion) -> OutsideMotion:
+        """A motion without the gyroscope's bias, as far as that is known.
+
+        The bias turns the way by half of what it turns the end.
+        """
         if motion.rates_rad_s is None:
             return motion
         half = SE3.exp(np.r_[np.zeros(3), -0.5 * motion.seconds * self._bias]).rotation

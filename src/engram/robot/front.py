@@ -233,7 +233,9 @@ class Front:
 
     def _trusted(self, measured: OutsideMotion | None) -> OutsideMotion | None:
         """What wheels and gyroscope measured since the last frame, while they can be trusted."""
-        return None if self._outside.guess() is None else measured
+        if measured is None or self._outside.guess() is None:
+            return None
+        return self._outside.corrected(measured)
 
     def _moved(self, step: OdometryStep, frame: Frame, *, doubted: bool) -> Motion:
         """Odometry's step weighed against those before it, and against wheels and gyroscope."""
