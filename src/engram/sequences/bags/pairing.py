@@ -48,6 +48,8 @@ class Pairing:
         paired: pairs of one instant.
         largest_offset_ns: largest offset among them.
         unusable: images that could not be decoded or do not fit.
+        placed: left images that have a time, and so a right one or none.
+        complete: whether the pass reached the end of the bag; if not, some images still waited.
         clocks: of the left and of the right stamps.
     """
 
@@ -57,6 +59,8 @@ class Pairing:
     paired: int = 0
     largest_offset_ns: int = 0
     unusable: int = 0
+    placed: int = 0
+    complete: bool = False
     clocks: tuple[SteadyClock, SteadyClock] = field(
         default_factory=lambda: (SteadyClock(waits=True), SteadyClock(waits=True))
     )
@@ -68,9 +72,10 @@ class Pairing:
 
     def text(self) -> str:
         """For people, in one line."""
-        share = 100 * self.paired / self.left if self.left else 0.0
+        met = self.left if self.complete else self.placed
+        share = 100 * self.paired / met if met else 0.0
         facts = [
-            f"{self.paired} of {counted(self.left, 'left image')} paired ({share:.1f} %), at most "
+            f"{self.paired} of {counted(met, 'left image')} paired ({share:.1f} %), at most "
             f"{self.largest_offset_ns / 1e6:.3f} ms apart (tolerance "
             f"{self.tolerance_ns / 1e6:.3f} ms)"
         ]
@@ -129,9 +134,11 @@ def pairs_of(
     for shot, other in paired(timed[0], timed[1], pairing.tolerance_ns):
         if shot is None:
             continue
+        pairing.placed += 1
         if other is not None:
             pairing.paired += 1
             offset_ns = abs(other.stamp_ns - shot.stamp_ns)
             if offset_ns <= pairing.tolerance_ns:
                 pairing.largest_offset_ns = max(pairing.largest_offset_ns, offset_ns)
         yield shot, None if other is None else other.item
+    pairing.complete = True
