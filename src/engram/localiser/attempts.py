@@ -362,6 +362,14 @@ class Attempter:
             anywhere and plausible(match, spread, acceptance),
         )
 
+    def with_rows(self, live: Frame, live_id: NodeId, outcome: Outcome) -> Match:
+        """The match of an outcome, with the rows of its inliers: a kept one may be without."""
+        match = outcome.match
+        if len(match.live_rows) == match.inliers:
+            return match
+        question = self._question(live_id, outcome.candidate)
+        return match if question is None else self._lanes.match(live, [question])[0]
+
     def _spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
         if self._matcher is None:
             return inlier_spread(match, self._frames.frame(node), live)

@@ -599,8 +599,11 @@ class Localiser:
         reference = self._attempter.frame(found.candidate.node)
         if usual is None or reference is None:
             return None
+        match = self._attempter.with_rows(live, node_id(self.live, live.stamp_ns), found)
+        if not len(match.live_rows):
+            return None
         tracked = self._motion.odometry.inliers
-        return Likeness.of(found.match, reference, live, usual, tracked)
+        return Likeness.of(match, reference, live, usual, tracked)
 
     def _without_damaged(self, outcomes: list[Outcome]) -> list[Outcome]:
         """Outcomes of readable nodes; the others are reported, and not attempted again."""
