@@ -17,7 +17,7 @@ from engram.robot import RobotOptions, Settings, map_drive, open_drive
 FRAME_KEYS = {
     "stamp_ns", "status", "node", "node_stamp_ns", "node_from_live", "inliers", "attempts",
     "confidence", "withdraws",
-    "candidates", "open_loop_m", "ms", "damaged",
+    "candidates", "open_loop_m", "ms", "damaged", "fixed_share",
 }  # fmt: skip
 STATUSES = {"localised", "dead_reckoning", "lost", "no_odometry"}
 

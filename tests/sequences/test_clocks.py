@@ -69,7 +69,7 @@ def test_photos_at_any_times_are_all_read_but_lone_ones_at_either_end(intervals_
         stamps_ns.append(now_ns)
     found = files(stamps_ns)
     assert all(found.times_ns[number] == stamps_ns[number] for number in found.times_ns)
-    assert len(found.lost(len(stamps_ns))) <= 4
+    assert len(found.lost(len(stamps_ns))) <= 6  # three at each end
 
 
 @st.composite
