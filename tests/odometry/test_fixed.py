@@ -14,7 +14,13 @@ from engram.geometry import SE3
 from engram.odometry import FixedConfig, FixedPixels, Odometry, OutsideModel, OutsideMotion
 from engram.odometry.fixed import kept_rows
 from engram_lab.bench.data import synthetic_drive
-from engram_lab.studies.faults.injected import FixedPattern, halved, on_both, reaching_in
+from engram_lab.studies.faults.injected import (
+    FixedPattern,
+    brightened,
+    halved,
+    on_both,
+    reaching_in,
+)
 
 STEP_M = 0.8
 FRAMES = 16
@@ -55,7 +61,7 @@ def driven(
             outside.add(OutsideMotion(told, 0.1))
         look = fixed.look(frame, outside.guess(), told if k else None)
         step = odometry.step(look.frame)
-        fixed.note(step.prev_from_curr)
+        fixed.note(step.prev_from_curr, step.inliers)
         way_m += step.moved_m
         thinned += look.frame is not frame
         doubted += look.doubted
@@ -93,6 +99,16 @@ def test_a_robot_at_rest_learns_nothing(pairs) -> None:
     fixed, way_m, thinned, doubted = driven(at_rest(pairs))
     assert (fixed.share, thinned, doubted) == (0.0, 0, 0)
     assert way_m < 0.05
+
+
+def test_a_robot_at_rest_in_light_that_comes_and_goes_is_believed(pairs) -> None:
+    dimmed = [
+        on_both(one, lambda image, k=k: brightened(image, 0.35 + 0.325 * (1 + np.sin(k / 3))))
+        for k, one in enumerate(at_rest(pairs))
+    ]
+    fixed, way_m, _, doubted = driven(dimmed)
+    assert (fixed.share, doubted, fixed.doubts) == (0.0, 0, 0)
+    assert way_m < 0.1
 
 
 def passing(pairs: Sequence[StereoPair]) -> list[StereoPair]:

@@ -91,7 +91,7 @@ class FixedConfig:
             le=1,
             description="least share of the near landmarks that keep their pixels, where",
         ),
-    ] = 0.4
+    ] = 0.5
     behind_keeps: Annotated[
         float,
         Meta(
@@ -100,7 +100,7 @@ class FixedConfig:
             description="at most this share of those behind them does: then the near ones ride "
             "along with the camera",
         ),
-    ] = 0.15
+    ] = 0.1
     behind: Annotated[
         float, Meta(gt=0, lt=1, description="and these are at least this share of all")
     ] = 0.25
@@ -202,8 +202,8 @@ class FixedPixels:
         # Of the last look: motion by odometry from the reference to the frame before, and by the
         # landmarks that kept no pixel to this one.
         self._others: tuple[SE3 | None, SE3] | None = None
-        # Whether what lies behind something near moved, however far.
-        self._moves = False
+        # How many landmarks kept their pixels before a world that moved, however far.
+        self._near = 0
         # Whether odometry rested where the others moved.
         self._led_astray = False
         self._age = self._looked = 0
@@ -238,17 +238,20 @@ class FixedPixels:
         self._reference, self._age = None, 0
         self._outside = self._seen = self._step = None
 
-    def note(self, step: SE3 | None) -> bool:
+    def note(self, step: SE3 | None, inliers: int) -> bool:
         """Takes the motion to the frame of the last look by odometry.
 
         Args:
             step: prev_from_curr; None if it failed.
+            inliers: landmarks that agree on it.
 
         Returns:
             Whether odometry all but rests where the others of that look have moved: it may follow
             a lorry ahead, or something on the lens.
         """
-        (others, self._others), (moves, self._moves) = (self._others, None), (self._moves, False)
+        (others, self._others), (near, self._near) = (self._others, None), (self._near, 0)
+        # Where far more agree on a rest than lie near, the world rests with them.
+        moves = near > 0 and inliers <= self._config.majority * near
         told = moves or others is not None
         if step is not None and told:
             self._led_astray = moves and step.distance_m < _LEAST_M and step.angle_rad < _LEAST_RAD
@@ -328,7 +331,7 @@ class FixedPixels:
     ) -> NDArray[np.bool_]:
         """Votes for what is nearer than the world and rests; its landmarks in the frame."""
         if near.any():
-            self._suspicious, self._moves = True, True
+            self._suspicious, self._near = True, int(np.count_nonzero(near))
             self._vote(reference, near, np.zeros(0, np.intp))
         return _there(kept[near], len(frame.landmarks))
 

@@ -198,7 +198,7 @@ class Front:
             if self._stands.add(step.prev_from_curr, self._trusted(measured)):
                 frame = replace(frame, status=FrameStatus.FROZEN)
                 step = OdometryStep(OdometryStatus.UNUSABLE_FRAME)
-            if astray := self._fixed.note(step.prev_from_curr):
+            if astray := self._fixed.note(step.prev_from_curr, step.inliers):
                 # Nobody knows how long it was led astray, nor how fast the robot is.
                 self._gaps = GapFiller(self._settings.gaps)
             motion = self._moved(step, frame, doubted=astray or look.doubted)
