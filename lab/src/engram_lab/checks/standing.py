@@ -9,7 +9,7 @@ where nothing is fixed.
 Clips: KITTI 06, with its truth; KITTI raw 0001, against odometry of the undisturbed drive; a street
 that is rendered. The real ones need ENGRAM_DATA.
 
-python -m engram_lab.checks.standing [--json FILE]
+python -m engram_lab.checks.standing [--only CLIP] [--json FILE]
 """
 
 from __future__ import annotations
@@ -218,9 +218,11 @@ def sound(clip: Clip) -> Iterator[Figure]:
         yield Figure(f"{name}: in doubt", front.doubts, "frames")
 
 
-def figures() -> Iterator[Figure]:
-    """All of it, clip by clip."""
+def figures(only: str | None = None) -> Iterator[Figure]:
+    """All of it, clip by clip; None for all clips."""
     for name, clip in clips():
+        if only not in {None, name}:
+            continue
         for contrast in CONTRASTS:
             yield from _told(f"{name}: pattern, contrast {contrast}", patterns(clip, contrast))
         for what, count in frozen(clip):
@@ -237,8 +239,10 @@ def _told(name: str, count: Count) -> Iterator[Figure]:
 
 def main() -> None:
     """Prints the figures."""
-    asked = command_line(__doc__).parse_args()
-    report(figures(), asked.json, "standing")
+    parser = command_line(__doc__)
+    parser.add_argument("--only", metavar="CLIP", help="street, kitti-06 or raw-0001")
+    asked = parser.parse_args()
+    report(figures(asked.only), asked.json, "standing")
 
 
 if __name__ == "__main__":
