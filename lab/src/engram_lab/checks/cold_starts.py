@@ -153,7 +153,7 @@ def cold_start(live: LiveDrive, first: int, relocaliser: Relocaliser, budget: Bu
             frame, odometry = live.frames[at].frame, live.frames[at].odometry
             if at == first:
                 odometry = OdometryStep(OdometryStatus.FIRST)
-            localiser.move(gaps.motion(odometry, frame.stamp_ns))
+            localiser.move(gaps.motion(odometry, frame.stamp_ns, landmarks=len(frame.landmarks)))
             found = localiser.localise(frame)
             attempts, driven_m = attempts + found.attempts, localiser.driven_m
             if found.node is not None and found.node_from_live is not None:

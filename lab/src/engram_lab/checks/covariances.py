@@ -58,7 +58,9 @@ def add_motion(errors: Errors, street: Street) -> None:
     ways: list[tuple[int, Position]] = []
     nowhere: NodeId = node_id(street.live.session.id, 0)
     for number, logged in enumerate(street.frames):
-        motion = gaps.motion(logged.odometry, logged.frame.stamp_ns)
+        motion = gaps.motion(
+            logged.odometry, logged.frame.stamp_ns, landmarks=len(logged.frame.landmarks)
+        )
         if not motion.usable:
             continue
         step, covariance = motion.prev_from_curr, motion.covariance

@@ -135,7 +135,9 @@ def record(
             odometry = one.odometry if number else OdometryStep(OdometryStatus.FIRST)
             motion = odometry.prev_from_curr
             step_m = 0.0 if motion is None else motion.distance_m
-            localiser.move(gaps.motion(odometry, one.frame.stamp_ns))
+            localiser.move(
+                gaps.motion(odometry, one.frame.stamp_ns, landmarks=len(one.frame.landmarks))
+            )
             length_m += step_m
             before = len(recording.seen)
             localiser.localise(one.frame)

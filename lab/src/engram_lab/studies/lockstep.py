@@ -176,7 +176,10 @@ def run_in_step(
     # robot, on several threads, the time until the answer counts.
     clock = perf_counter if matcher is None else thread_time
     gaps = GapFiller(settings.gaps)
-    motions = [gaps.motion(one.odometry, one.frame.stamp_ns) for one in frames]
+    motions = [
+        gaps.motion(one.odometry, one.frame.stamp_ns, landmarks=len(one.frame.landmarks))
+        for one in frames
+    ]
     step_m = driven_steps_m(motions, [one.frame.stamp_ns for one in frames])
     search = SharedSearch(situation.opened.graph.neighbourhood)
     parts = LocaliserParts(
