@@ -1,14 +1,15 @@
 """Streets of equal fronts: robots on a street that is not mapped, beside one that is.
 
     python -m engram_lab.checks.equal_fronts                     # 20, 30 and 37.5 m, three towns
+    python -m engram_lab.checks.equal_fronts --first-town 601    # the same fronts in other towns
     python -m engram_lab.checks.equal_fronts --periods 25 --equal 0.8 --unique things,cars
-    python -m engram_lab.checks.equal_fronts --json equal.json
+    python -m engram_lab.checks.equal_fronts --beside 3 --starts 1 --json equal.json    # minutes
 
 One ring of a town is mapped. Robots drive along the ring beside it, whose fronts are the same:
 switched on there, or told that they are on the mapped one. Every fix is false. Then the ring alone,
 and both rings, are mapped: edges between places that are more than 1 m wrong are counted. Last, a
 later drive is localised on the mapped ring, from a true start. Towns are rendered if they are not
-there yet.
+there yet, session by session: a run that was stopped goes on with the next one.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from engram.graph.model import EdgeKind
 from engram.maps import open_map
 from engram.robot import Settings
 from engram_lab.misplaced import FALSE_M, Kind, Street, Try
-from engram_lab.programs import Figure, command_line, report
+from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.studies.building import GENEROUS, build_map, true_nodes
 from engram_lab.studies.drives import EvaluatedDrive, drives_of
 from engram_lab.town.campaigns import Campaign, estate
@@ -34,9 +35,9 @@ from engram_lab.town.streets import Fronts, Unique
 _FIRST_TOWN = 501
 PERIODS_M = (20.0, 30.0, 37.5)
 # Numbers of the estate's drives: that of the map, one on the same ring, those beside it.
-MAPPED, AGAIN, BESIDE = 0, 1, (3, 2)
+MAPPED, AGAIN, BESIDE = 0, 1, [3, 2]
 # A fix is sure from here on.
-_SURE = 7.0
+SURE = 7.0
 _BETWEEN_PLACES = frozenset({EdgeKind.MATCH, EdgeKind.TIE})
 
 
@@ -71,7 +72,7 @@ def counted(street: Street, one: Try) -> Counted:
         found, false = looked.found, None
         if found.node is not None and found.node_from_live is not None:
             false = street.is_false(looked.frame, found.node, found.node_from_live)
-        sure = false is True and found.confidence > _SURE
+        sure = false is True and found.confidence > SURE
         total += Counted(1, false is False, false is True, sure)
     return total
 
@@ -95,12 +96,16 @@ class Estate:
     Args:
         campaign: the town.
         settings: of the robots, and of those that map.
+        beside: numbers of the drives on the ring that is not mapped.
     """
 
-    def __init__(self, campaign: Campaign, settings: Settings) -> None:
-        simulate(campaign, campaigns_folder(), sessions=[MAPPED, AGAIN, *BESIDE])
+    def __init__(
+        self, campaign: Campaign, settings: Settings, beside: Sequence[int] = tuple(BESIDE)
+    ) -> None:
+        simulate(campaign, campaigns_folder(), sessions=[MAPPED, AGAIN, *beside])
         self._folder = campaign_folder(campaigns_folder(), campaign)
-        self._campaign, self._settings = campaign, settings
+        self._campaign, self._settings, self._beside = campaign, settings, beside
+        self._maps: dict[tuple[int, ...], Path] = {}
         self.mapped = self._drive(MAPPED)
 
     def _drive(self, number: int) -> EvaluatedDrive:
@@ -112,17 +117,20 @@ class Estate:
         return Street(path, [self.mapped], self._drive(number), self._settings, 8)
 
     def _built(self, numbers: Sequence[int]) -> Path:
-        """A map of some drives, made anew: it hangs on the settings."""
+        """A map of some drives, made anew by each run: it hangs on the settings."""
+        if tuple(numbers) in self._maps:
+            return self._maps[tuple(numbers)]
         path = self._folder / f"equal{''.join(map(str, numbers))}.engram"
         for file in self._folder.glob(f"{path.stem}.*"):
             file.unlink()
         drives = [self._drive(number) for number in numbers]
-        return build_map(path, drives, self._settings, GENEROUS).path
+        self._maps[tuple(numbers)] = build_map(path, drives, self._settings, GENEROUS).path
+        return self._maps[tuple(numbers)]
 
     def beside(self, kind: Kind, starts: int) -> Counted:
         """Robots that drive to the end of the unmapped ring, from so many places."""
         total = Counted()
-        for number in BESIDE:
+        for number in self._beside:
             street = self._street(number)
             for first in np.linspace(0, len(street.frames), starts, endpoint=False, dtype=int):
                 total += counted(street, Try(kind, int(first)))
@@ -136,8 +144,9 @@ class Estate:
         street.close()
         return found
 
-    def edges(self, numbers: Sequence[int]) -> tuple[int, int]:
-        """Edges between places of a map of some drives, and how many are wrong."""
+    def edges(self, *, both: bool) -> tuple[int, int]:
+        """Edges between places of a map of the ring, or of both; and how many are wrong."""
+        numbers = [MAPPED, *(self._beside if both else [])]
         return wrong_edges(self._built(numbers), [self._drive(number) for number in numbers])
 
 
@@ -149,8 +158,8 @@ def figures(towns: Sequence[Estate], starts: int) -> Iterator[Figure]:
         yield Figure("  false fixes", found.false)
         yield Figure("  of the frames", 100 * found.false / found.frames, "%")
         yield Figure("  with confidence above 7", found.sure)
-    for name, numbers in (("mapped ring", [MAPPED]), ("both rings", [MAPPED, *BESIDE])):
-        edges = [town.edges(numbers) for town in towns]
+    for name, both in (("mapped ring", False), ("both rings", True)):
+        edges = [town.edges(both=both) for town in towns]
         whole, wrong = (sum(column) for column in zip(*edges, strict=True))
         yield Figure(f"{name}: edges between places", whole)
         yield Figure("  more than 1 m wrong", wrong)
@@ -164,6 +173,8 @@ def main() -> None:
     """Runs the program."""
     parser = command_line(__doc__)
     parser.add_argument("--periods", default=",".join(map(str, PERIODS_M)), help="metres")
+    parser.add_argument("--first-town", type=int, default=_FIRST_TOWN, help="its seed")
+    parser.add_argument("--beside", type=numbers, default=BESIDE, help="drives beside: 2, 3, 5, 6")
     parser.add_argument("--equal", type=float, default=1.0, help="share of equal fronts")
     parser.add_argument("--unique", default=",".join(Unique), help="what is unique")
     parser.add_argument("--starts", type=int, default=2, help="of each kind on each drive")
@@ -173,7 +184,9 @@ def main() -> None:
     settings = read_settings(None, asked.set).of_robot()
     towns = [
         Estate(
-            estate(_FIRST_TOWN + at, fronts=Fronts(float(period), asked.equal, unique)), settings
+            estate(asked.first_town + at, fronts=Fronts(float(period), asked.equal, unique)),
+            settings,
+            asked.beside,
         )
         for at, period in enumerate(asked.periods.split(","))
     ]
