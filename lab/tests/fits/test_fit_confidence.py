@@ -7,7 +7,7 @@ import pytest
 
 from engram.localiser import Spread
 from engram.localiser.confidence import Evidence, Standing
-from engram_lab.fits.confidence import Row, Rows, fitted, judged, logistic
+from engram_lab.fits.confidence import Row, Rows, fitted, judged, judged_lookalikes, logistic
 
 RNG = np.random.default_rng(3)
 
@@ -78,3 +78,18 @@ def test_wrong_matches_are_counted_against_what_is_claimed() -> None:
     claimed = known.as_predicted(met[0].evidence)
     assert figures["  of them wrong"] == 25
     assert figures["  by what is claimed"] == pytest.approx(500 / (1 + math.exp(claimed)))
+
+
+def test_look_alikes_are_counted_by_what_is_claimed_of_them_and_right_ones_are_not() -> None:
+    kinds = ("predicted", "doubted", "told", "anywhere")
+    met = [row for kind in kinds for row in rows(300, kind, right=True)]
+    met += [row for kind in kinds for row in rows(100, kind, right=False)]
+    known = fitted(Rows(met, []), 45)
+    strong = max(met, key=lambda row: known.as_predicted(row.evidence)).evidence
+    weak = min(met[-100:], key=lambda row: known.as_anywhere(row.evidence)).evidence
+    assert known.as_predicted(strong) > 7
+    alike = [Row(strong, 80.0, 0.0)] * 3 + [Row(weak, 80.0, 0.0)] * 2 + [Row(strong, 0.1, 0.0)] * 9
+    figures = {one.name: one.value for one in judged_lookalikes(known, alike)}
+    assert figures["look-alikes judged"] == 5
+    assert figures["  believed where fixes lead to expect them"] == 3
+    assert figures["  claimed with more than 7"] == 3

@@ -11,7 +11,9 @@ for their number. A logistic model is fitted for each reading of a match, and th
 what would be claimed of the matches that robots met. On the held-out towns, without those
 look-alikes, log loss is compared with that of a logistic in inliers alone, and bin by bin how many
 matches are wrong with how many would be by what is claimed. With `--shipped` the calibration is
-fitted, too, and printed: `--shipped --towns 301,302,303,304` made the one that ships.
+fitted, too, and printed: `--shipped --towns 301,302,303,304` made the one that ships. With
+`--estates` it is also judged on streets of equal fronts, on none of which it is fitted: what is
+claimed of look-alikes that a whole street is made of.
 """
 
 from __future__ import annotations
@@ -41,8 +43,12 @@ from engram.localiser.confidence import (
 )
 from engram.monitor import Monitor, write_whole
 from engram.robot import Settings
-from engram_lab.misplaced import FALSE_M, FALSE_RAD, Kind, Looked, Street
+from engram_lab.checks.equal_fronts import BESIDE, MAPPED, SURE
+from engram_lab.misplaced import FALSE_M, FALSE_RAD, Kind, Looked, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
+from engram_lab.studies.drives import drives_of
+from engram_lab.town.campaigns import estate
+from engram_lab.town.simulating import campaign_folder, simulate
 from engram_lab.trial_towns import (
     BY_NIGHT,
     FITTED_TOWNS,
@@ -368,6 +374,45 @@ def passing(model: ConfidenceModel, rows: Rows) -> Iterator[Figure]:
             yield Figure(f"{name}: {what} that pass, of {len(known)}", passed)
 
 
+def estate_rows(towns: Sequence[int], settings: Settings, monitor: Monitor) -> list[Row]:
+    """Matches of robots that are switched on beside a mapped ring of equal fronts: all are wrong.
+
+    Args:
+        towns: seeds of the estates, which are rendered if they are not there.
+        settings: the configuration.
+        monitor: hears of what is collected.
+    """
+    rows: list[Row] = []
+    for seed in towns:
+        campaign, folder = estate(seed), towns_folder(settings)
+        simulate(campaign, folder, sessions=[MAPPED, BESIDE[0]], settings=settings, monitor=monitor)
+        mapped, beside = (
+            drives_of([campaign_folder(folder, campaign) / f"{plan.name}.framelog"])[0]
+            for plan in (campaign.session(MAPPED), campaign.session(BESIDE[0]))
+        )
+        path = campaign_folder(folder, campaign) / f"map{MAPPED}-{METHOD_VERSION}.engram"
+        street = Street(path, [mapped], beside, settings, _LOST_ROUNDS)
+
+        def met(street: Street = street) -> Iterator[Row]:
+            for looked in street.run(Try(Kind.COLD, 0)):
+                yield from rows_of(street, looked)
+
+        rows += _kept(path.with_name(f"{path.stem}-beside.jsonl"), met, monitor)
+        street.close()
+    return rows
+
+
+def judged_lookalikes(model: ConfidenceModel, rows: Sequence[Row]) -> Iterator[Figure]:
+    """What is claimed of look-alikes: how many matches, how many would be fixes, how many sure."""
+    claimed, right = _claims(model, [row for row in rows if not row.right])
+    yield Figure("look-alikes judged", len(right))
+    for name, least in (
+        ("believed where fixes lead to expect them", AcceptanceConfig().min_confidence),
+        ("claimed with more than 7", SURE),
+    ):
+        yield Figure(f"  {name}", int((claimed > least).sum()))
+
+
 def _is_anywhere(row: Row) -> bool:
     near = row.evidence.distance_m <= AcceptanceConfig().reach_m
     return near and row.evidence.spread is not None and not _is_sure(row.evidence)
@@ -401,6 +446,7 @@ def main() -> None:
     parser.add_argument("--kind", type=DescriptorKind, default=BRIEF, help="of features")
     parser.add_argument("--towns", type=numbers, default=list(FITTED_TOWNS))
     parser.add_argument("--held-out", type=numbers, default=list(HELD_OUT_TOWNS))
+    parser.add_argument("--estates", type=numbers, default=[], help="towns of equal fronts")
     parser.add_argument("--shipped", action="store_true", help="judge the weights that are shipped")
     asked = parser.parse_args()
     settings = Settings().for_descriptor(asked.kind)
@@ -417,6 +463,9 @@ def main() -> None:
     report(passing(model, rows), None, "confidence, fitted towns")
     held_out = collected(asked.held_out, folder, settings, Bars())
     report(judged(model, held_out.met, rows.met), asked.json, "confidence, held-out towns")
+    if asked.estates:
+        alike = estate_rows(asked.estates, settings, Bars())
+        report(judged_lookalikes(model, alike), asked.json, "confidence, streets of equal fronts")
 
 
 if __name__ == "__main__":
