@@ -286,12 +286,13 @@ def _robots(
 ) -> Iterator[list[_Running]]:
     """One per configuration; in one map they share what is known of it."""
     with ExitStack() as stack:
-        front, keeper, running = Front(settings), _Placing(situation), list[_Running]()
+        keeper, running = _Placing(situation), list[_Running]()
         for one in configurations:
             own: LocaliserParts = {**parts, "policy": one.policy, "budget": one.budget}
             asked = _settings_for(settings, one, guided=parts["matcher"] is None)
             localiser = localiser_in(situation.opened, situation.drive.camera, asked, **own)
-            robot = stack.enter_context(Robot(front, localiser, keeper))
+            # Each has a front of its own, which tells time by the frames that it takes.
+            robot = stack.enter_context(Robot(Front(settings), localiser, keeper))
             running.append(_Running(robot, localiser))
         yield running
 
