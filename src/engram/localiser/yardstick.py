@@ -93,7 +93,7 @@ class LookalikeConfig:
         float, Meta(ge=0, description="m after which a believed run is looked at again")
     ] = 2.0
     forgotten_after_m: Annotated[
-        float, Meta(gt=0, description="m without a match after which a run begins anew")
+        float, Meta(gt=0, description="m without a match after which a run begins again")
     ] = 30.0
 
     def __post_init__(self) -> None:

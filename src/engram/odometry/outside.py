@@ -65,7 +65,7 @@ class OutsideConfig:
         rest_m_s, rest_rad_s: speeds below which the robot rests.
         straight_rad_s: turn rate below which the gyroscope's bias is learnt.
         greatest_m_s2, greatest_change: acceleration, and change of speed as a share of it, beyond
-            which wheels slip or stick: they must agree anew with sure images.
+            which wheels slip or stick: they must agree again with sure images.
     """
 
     scale_error: Annotated[float, Meta(gt=0, le=1)] = 0.05

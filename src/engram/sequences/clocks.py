@@ -83,7 +83,7 @@ class ClockStep:
 
 @dataclass(frozen=True, slots=True)
 class StampReport:
-    """What became of the stamps of a stream.
+    """What happened to the stamps of a stream.
 
     Attributes:
         count: stamps.
@@ -253,7 +253,7 @@ class SteadyClock:
 
     @property
     def report(self) -> StampReport:
-        """What became of the stamps so far."""
+        """What happened to the stamps so far."""
         repeated, early, ahead = (self._counts[one] for one in StampFault)
         return StampReport(self._count, repeated, early, ahead, self._example, tuple(self.steps))
 

@@ -61,7 +61,7 @@ class ImageSequence:
         cameras: its stereo pair, with the rectification of raw images.
         camera: its one camera, rectified.
         frames: the used frames of the drive.
-        stamps: what became of the stamps of the whole drive.
+        stamps: what happened to the stamps of the whole drive.
 
     Raises:
         SequenceError: a chosen pair is bad and `skip_bad` is not set, or none is left.

@@ -85,7 +85,7 @@ class WrongStamp(str):
 
 
 def stamp_report(places: Listing) -> StampReport:
-    """What became of the stamps of a listing."""
+    """What happened to the stamps of a listing."""
     wrong = [place for place in places if isinstance(place, WrongStamp)]
     faults = [place.fault for place in wrong]
     return StampReport(

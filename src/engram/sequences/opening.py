@@ -50,7 +50,7 @@ _RECORDINGS = {
 
 
 def stamps_of(sequence: object) -> StampReport:
-    """What became of the stamps of a drive; a frame log has times."""
+    """What happened to the stamps of a drive; a frame log has times."""
     if isinstance(sequence, ImageSequence | BagSequence):
         return sequence.stamps
     return StampReport()

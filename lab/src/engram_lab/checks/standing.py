@@ -49,7 +49,7 @@ _DEPTH_M = 2.4
 
 @dataclass(slots=True)
 class Count:
-    """What came of some drives.
+    """The results of some drives.
 
     Attributes:
         drives: how many were mapped.

@@ -67,7 +67,7 @@ class Pairing:
 
     @property
     def stamps(self) -> StampReport:
-        """What became of the stamps of the left images, and of right ones without theirs."""
+        """What happened to the stamps of the left images, and of right ones without theirs."""
         return joined(*(clock.report for clock in self.clocks))
 
     def text(self) -> str:

@@ -154,7 +154,7 @@ class BagSequence:
 
     @property
     def stamps(self) -> StampReport:
-        """What became of the stamps of its images, in the latest pass."""
+        """What happened to the stamps of its images, in the latest pass."""
         return self.pairing.stamps
 
     def read_stamps(self) -> StampReport:
