@@ -26,6 +26,8 @@ from engram_lab.studies.drives import EvaluatedDrive
 
 # A fix further from the truth is false.
 FALSE_M = 1.0
+# A fix claims to be sure from this confidence on.
+SURE = 7.0
 FALSE_RAD = float(np.deg2rad(5.0))
 # A robot is misplaced by at least this much, told so with these standard deviations.
 OFF_M = 15.0

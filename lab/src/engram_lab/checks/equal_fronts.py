@@ -24,20 +24,16 @@ from engram.cli.settings import read_settings
 from engram.graph.model import EdgeKind
 from engram.maps import open_map
 from engram.robot import Settings
-from engram_lab.misplaced import FALSE_M, Kind, Street, Try
+from engram_lab.misplaced import FALSE_M, SURE, Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.studies.building import GENEROUS, build_map, true_nodes
 from engram_lab.studies.drives import EvaluatedDrive, drives_of
-from engram_lab.town.campaigns import Campaign, estate
+from engram_lab.town.campaigns import AGAIN, BESIDE, MAPPED, Campaign, estate
 from engram_lab.town.simulating import campaign_folder, campaigns_folder, simulate
 from engram_lab.town.streets import Fronts, Unique
 
 _FIRST_TOWN = 501
 PERIODS_M = (20.0, 30.0, 37.5)
-# Numbers of the estate's drives: that of the map, one on the same ring, those beside it.
-MAPPED, AGAIN, BESIDE = 0, 1, [3, 2]
-# A fix is sure from here on.
-SURE = 7.0
 _BETWEEN_PLACES = frozenset({EdgeKind.MATCH, EdgeKind.TIE})
 
 

@@ -43,11 +43,10 @@ from engram.localiser.confidence import (
 )
 from engram.monitor import Monitor, write_whole
 from engram.robot import Settings
-from engram_lab.checks.equal_fronts import BESIDE, MAPPED, SURE
-from engram_lab.misplaced import FALSE_M, FALSE_RAD, Kind, Looked, Street, Try
+from engram_lab.misplaced import FALSE_M, FALSE_RAD, SURE, Kind, Looked, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.studies.drives import drives_of
-from engram_lab.town.campaigns import estate
+from engram_lab.town.campaigns import BESIDE, MAPPED, estate
 from engram_lab.town.simulating import campaign_folder, simulate
 from engram_lab.trial_towns import (
     BY_NIGHT,

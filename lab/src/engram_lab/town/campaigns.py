@@ -286,6 +286,10 @@ def _oxford(seed: int, size: Size) -> Campaign:
     return Campaign("oxford", seed, length, False, sessions, 0.9, size, "oxford", 0.65)
 
 
+# Numbers of the estate's drives: that of the map, one on the same ring, those beside it.
+MAPPED, AGAIN, BESIDE = 0, 1, [3, 2]
+
+
 def estate(seed: int, size: Size = Size.STANDARD, fronts: Fronts | None = None) -> Campaign:
     """Rings between equal fronts, one of them mapped, the other one beside it.
 
