@@ -114,6 +114,8 @@ class Localiser:
         self._prover = Prover(known.graph, self.config.acceptance)
         self._yardstick = Yardstick(known.graph, self._attempter.frame, self.config.matcher)
         self._run = Run(self.config.lookalikes)
+        # The last frame's best match, if it was doubted: a wrong calibration looks like it, too.
+        self._doubted: Outcome | None = None
         self._hypotheses = Hypotheses(
             known.graph,
             self._nodes_near,
@@ -211,7 +213,7 @@ class Localiser:
             and not one.damaged
             and self._graph.node(one.candidate.index).session != self.live
         ]
-        best = max(tried, key=lambda one: one.match.inliers, default=None)
+        best = max(tried, key=lambda one: one.match.inliers, default=self._doubted)
         return None if best is None else self._attempter.frame(best.candidate.node)
 
     def attempts(self) -> list[Attempt]:
@@ -576,6 +578,7 @@ class Localiser:
     def _believed(self, live: Frame, outcomes: list[Outcome]) -> list[Outcome]:
         """The same outcomes, none accepted while the run of matches may be one of look-alikes."""
         best = best_success(outcomes, self.config.acceptance.rule)
+        self._doubted = None
         if best is None or not self._tells_lookalikes(live):
             return outcomes
         predicted = best.evidence is not None and math.isfinite(best.evidence.apart)
@@ -587,6 +590,7 @@ class Localiser:
                 self._run.add(likeness, self._driven_m)
         if self._run.believed:
             return outcomes
+        self._doubted = best
         return [replace(one, accepted=False) if one.accepted else one for one in outcomes]
 
     def _tells_lookalikes(self, live: Frame) -> bool:
