@@ -31,8 +31,8 @@ def test_no_fix_after_a_stall_is_false(clip) -> None:
     found = stalls(clip[0], [(4, 36), (12, 36), (10, 18), (16, 40), (22, 45)])
     assert found.false == 0
     assert found.fixes > 50
-    if clip[1]:  # the map knows where the robot is afterwards
-        assert found.again == [0] * 5
+    if clip[1]:  # the map knows where the robot is; two frames tell a stall from a wrong stamp
+        assert all(one <= 2 for one in found.again)
 
 
 @pytest.mark.data
