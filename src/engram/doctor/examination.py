@@ -87,7 +87,7 @@ class Evidence:
         sharpness: of every few pairs.
         matches: left-right matches of every few pairs, and the number of their frame.
         read: what happened to the stamps in the reader of the drive.
-        taken: what became of them in a robot, which has its frames one by one.
+        taken: what happened to them in a robot, which has its frames one by one.
         bad: why other pairs were left out: an image is missing, unreadable or of another size.
         outside: each step as measured by wheels or another source; None where it was not.
         turned_rad: how far each step turned by gyroscope or wheels; None where it was not measured.

@@ -276,7 +276,7 @@ class FixedPixels:
             told: the motion since the last frame by them, prev_from_curr; None if not measured.
         """
         self._outside = None if self._outside is None or told is None else self._outside @ told
-        if frame.status is not FrameStatus.OK:
+        if frame.status is not FrameStatus.OK or not len(frame.landmarks):
             return FixedLook(frame)
         self._age, self._looked = self._age + 1, self._looked + 1
         reference = self._reference
@@ -310,12 +310,16 @@ class FixedPixels:
         finds = self._suspicious or (parted is not None and bool(self._cells.any()))
         self._refer(frame, other_span=not finds)
         if parted is None:
+            if _stands(told, outside):  # what lies behind has vanished, not moved
+                return FixedLook(self._without(frame))
             near = self._near_rests(reference, keeps)
             return FixedLook(self._without(frame, self._thing(reference, frame, kept, near)))
         world = self._world(reference, parted, _rests(told, outside, parted.motion))
         if world is not _World.RESTS:
             self._others = self._seen, parted.motion
-        if not self._suspicious or world is _World.RESTS:
+        if world is _World.RESTS:
+            return FixedLook(self._without(frame))
+        if not self._suspicious:
             self._vote(reference, np.zeros(len(kept), np.bool_), parted.moving)
             return FixedLook(self._without(frame))
         defies = self._with_its_middle(reference, parted.defies, keeps)
@@ -567,6 +571,13 @@ def _there(rows: NDArray[np.int32], count: int) -> NDArray[np.bool_]:
 
 def _comparable(reference: Frame, frame: Frame) -> bool:
     return reference.camera == frame.camera and reference.descriptor == frame.descriptor
+
+
+def _stands(told: SE3 | None, outside: Guess | None) -> bool:
+    """Whether trusted wheels say that the camera stands."""
+    if told is None or outside is None or not outside.has_way:
+        return False
+    return told.distance_m < _LEAST_M and told.angle_rad < _LEAST_RAD
 
 
 def _rests(told: SE3 | None, outside: Guess | None, motion: SE3) -> bool | None:
