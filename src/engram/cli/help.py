@@ -6,6 +6,8 @@ from typing import Any
 
 from typer.core import TyperCommand
 
+# In an option's help: the names of all layouts, which only the help itself is worth importing for.
+LAYOUTS = "LAYOUTS"
 # Widest first column of a table; a longer one has its meaning on the next line.
 _COLUMN = 27
 
@@ -66,4 +68,8 @@ def _meaning(argument: Any, ctx: Any) -> str:
 
 def _record(parameter: Any, ctx: Any) -> tuple[str, str]:
     typed, meaning = parameter.get_help_record(ctx)
+    if LAYOUTS in meaning:
+        from engram.sequences import layout_names
+
+        meaning = meaning.replace(LAYOUTS, ", ".join(layout_names()))
     return typed, " ".join(meaning.split()).replace("]. [", "; ")

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
+from engram.cli.help import LAYOUTS
+
 if TYPE_CHECKING:
     from engram.cli.settings import AllSettings
     from engram.robot import RobotOptions
@@ -98,8 +100,7 @@ class Drive:
         typer.Option(
             "--format",
             metavar="NAME",
-            help="kitti, kitti-raw, euroc, tum-vi, robotcar, folder, bag, framelog "
-            "[default: detected].",
+            help=f"{LAYOUTS} [default: detected].",
         ),
     ] = None
     rig: Annotated[

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable
-from importlib.metadata import entry_points
 from typing import Any
 
 import typer
@@ -28,7 +28,8 @@ from engram.cli.maps import amend, check, info, plot, vocabulary
 from engram.cli.options import spread
 from engram.cli.showing import settings
 from engram.cli.view import view
-from engram.errors import InputError
+from engram.errors import ConfigError, IncompatibleError, InputError
+from engram.plugins import PluginGroup
 
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
     "Drives": {
@@ -61,9 +62,8 @@ NESTED: dict[str, dict[str, typer.Typer]] = {
     "Service": {"centre": centre_group, "agent": agent_group},
 }
 
-# Where installed packages name verbs of their own: functions, or Typer groups of them.
-ENTRY_POINTS = "engram.verbs"
-_BROUGHT = "Lab"
+# Section of the verbs that installed packages add.
+_ADDED = "Lab"
 # Characters of a summary: a line of 80 holds it beside the name.
 _SUMMARY = 62
 _RESUMABLE = "interrupted; finished parts are kept, and the same command resumes"
@@ -102,7 +102,7 @@ class Program(TyperGroup):
 
 
 def _group(verb: Any) -> str:
-    return str(getattr(verb, "rich_help_panel", None) or _BROUGHT)
+    return str(getattr(verb, "rich_help_panel", None) or _ADDED)
 
 
 def register(app: typer.Typer) -> None:
@@ -114,14 +114,46 @@ def register(app: typer.Typer) -> None:
         for name, group in groups.items():
             _prepare(group)
             app.add_typer(group, name=name, rich_help_panel=title)
-    for entry in sorted(entry_points(group=ENTRY_POINTS)):
-        brought = entry.load()
-        if not isinstance(brought, typer.Typer):
-            verb = _tells_of_interruption(spread(brought))
-            app.command(entry.name, cls=Verb, rich_help_panel=_BROUGHT)(verb)
-            continue
-        _prepare(brought)
-        app.add_typer(brought, name=entry.name, rich_help_panel=_BROUGHT)
+    own = {*VERBS, *(name for groups in NESTED.values() for name in groups)}
+    for name in _PLUGINS.names():
+        if name not in own:
+            _add(app, name)
+
+
+def _add(app: typer.Typer, name: str) -> None:
+    """Adds a verb of another package; one that cannot be used says so, and the others work."""
+    try:
+        added = _PLUGINS.load(name)
+    except IncompatibleError as error:
+        anything = {"ignore_unknown_options": True, "allow_extra_args": True}
+        register_as = app.command(name, cls=Verb, rich_help_panel=_ADDED, context_settings=anything)
+        register_as(_refusal(error))
+        return
+    if isinstance(added, typer.Typer):
+        _prepare(added)
+        app.add_typer(added, name=name, rich_help_panel=_ADDED)
+        return
+    verb = _tells_of_interruption(spread(added))
+    app.command(name, cls=Verb, rich_help_panel=_ADDED)(verb)
+
+
+def _refusal(error: IncompatibleError) -> Callable[[], None]:
+    def refused() -> None:
+        """Cannot be used: its package is broken."""
+        raise error
+
+    return refused
+
+
+def _checked(name: str, found: Any) -> Callable[..., None] | typer.Typer:
+    del name
+    if isinstance(found, typer.Typer) or inspect.isfunction(found):
+        return found
+    raise ConfigError(f"{found!r} is of type {type(found).__name__}, must be a function or a Typer")
+
+
+# Functions, or Typer groups of them.
+_PLUGINS = PluginGroup("engram.verbs", "verb", _checked)
 
 
 def _prepare(group: typer.Typer) -> None:

@@ -7,23 +7,21 @@ entry point of the group `engram.features` that names a `FeatureKind`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
-from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.errors import IncompatibleError
+from engram.errors import ConfigError, IncompatibleError
 from engram.frontend import network
 from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind, StereoPair
 from engram.frontend.matching import MatcherConfig
+from engram.plugins import PluginGroup, check_is
 
 if TYPE_CHECKING:
     from engram.frontend.frontend import FrontendConfig
 
-ENTRY_POINTS = "engram.features"
 NET = DescriptorKind(f"net@{network.MODEL}")
 
 # OpenCV's TEBLID takes the patch from keypoint size × scale factor; 7 and 5 suit corners without a
@@ -231,15 +229,16 @@ def feature_kind(name: str) -> FeatureKind:
         name: with or without its model.
 
     Raises:
-        IncompatibleError: the kind is unknown, or its model is another one here.
+        IncompatibleError: the kind is unknown, its model is another one here, or the package that
+            adds it cannot be used.
     """
     known = FEATURES.get(DescriptorKind(name))
     if known is not None:
         return known
     plain, _, model = name.partition("@")
-    brought = _brought()
-    if plain in brought:
-        kind: FeatureKind = brought[plain].load()
+    added = _PLUGINS.names()
+    if plain in added:
+        kind = _PLUGINS.load(plain)
         FEATURES[kind.name] = kind
     here = [kind for kind in FEATURES.values() if plain_name(kind.name) == plain]
     if here and model in {"", here[0].name.partition("@")[2]}:
@@ -250,7 +249,7 @@ def feature_kind(name: str) -> FeatureKind:
             f"{here[0].name}: install the Engram that made them, or make them again from the "
             f"images: engram record --features {plain}"
         )
-    names = sorted({plain_name(kind) for kind in FEATURES} | brought.keys())
+    names = sorted({*map(plain_name, FEATURES), *added})
     raise IncompatibleError(
         f"descriptors of kind {name!r} are unknown; known: {', '.join(names)}; "
         "install the package that adds them"
@@ -259,7 +258,7 @@ def feature_kind(name: str) -> FeatureKind:
 
 def known_kinds() -> list[FeatureKind]:
     """All kinds, those of installed packages too, in the order of their names."""
-    for name in _brought():
+    for name in _PLUGINS.names():
         feature_kind(name)
     return [FEATURES[name] for name in sorted(FEATURES)]
 
@@ -269,10 +268,14 @@ def plain_name(kind: str) -> str:
     return kind.partition("@")[0]
 
 
-@lru_cache(maxsize=1)
-def _brought() -> dict[str, Any]:
-    """Kinds of installed packages by name, not yet loaded."""
-    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
+def _checked(name: str, found: Any) -> FeatureKind:
+    kind = check_is(found, FeatureKind)
+    if plain_name(kind.name) != name:
+        raise ConfigError(f"its name is {kind.name!r}, must be {name!r}, or {name}@MODEL")
+    return kind
+
+
+_PLUGINS = PluginGroup("engram.features", "kind of features", _checked)
 
 
 def fitted_matcher(

@@ -1,16 +1,17 @@
 """Ranking policies Γ: the order in which to attempt the candidates (method §4).
 
 Each policy is one file and an entry of `POLICIES`. Other packages add policies by entry points of
-the group `ENTRY_POINTS`, each a callable without arguments that makes the policy.
+the group `engram.policies`, each a callable without arguments that makes the policy.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
-from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from typing import Any
 
 from engram.errors import ConfigError
+from engram.plugins import PluginGroup
 from engram.ranking.background import Background
 from engram.ranking.context import Foreseen, RankingContext, RankingPolicy, looks_ahead, uses_words
 from engram.ranking.distance import DistancePolicy
@@ -28,18 +29,11 @@ POLICIES: dict[str, Callable[[], RankingPolicy]] = {
     RecallPolicy.name: RecallPolicy,
     DistancePolicy.name: DistancePolicy,
 }
-ENTRY_POINTS = "engram.policies"
-
-
-@cache
-def _brought() -> dict[str, EntryPoint]:
-    """Policies of other installed packages, not yet imported."""
-    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
 
 
 def policy_names() -> list[str]:
     """All policies that `policy_named` knows: Engram's own, then those of other packages."""
-    return [*POLICIES, *(name for name in _brought() if name not in POLICIES)]
+    return [*POLICIES, *(name for name in _PLUGINS.names() if name not in POLICIES)]
 
 
 def policy_named(name: str) -> RankingPolicy:
@@ -47,13 +41,39 @@ def policy_named(name: str) -> RankingPolicy:
 
     Raises:
         ConfigError: the name is unknown; the message lists the known ones.
+        IncompatibleError: another package adds the policy, and it cannot be used.
     """
     if name in POLICIES:
-        return POLICIES[name]()
-    if name in _brought():
-        policy: RankingPolicy = _brought()[name].load()()
-        return policy
+        return _made(name, POLICIES[name])
+    if name in _PLUGINS.names():
+        return _PLUGINS.load(name)
     raise ConfigError(f"no ranking policy '{name}'; known: {', '.join(sorted(policy_names()))}")
+
+
+def _made(name: str, make: Any) -> RankingPolicy:
+    """The policy that a class or function makes.
+
+    Raises:
+        ConfigError: it is not a policy.
+    """
+    if not callable(make):
+        raise ConfigError(f"{make!r} cannot be called; name the policy's class")
+    policy: RankingPolicy = make()
+    what = type(policy).__name__
+    rank = getattr(policy, "rank", None)
+    if not callable(rank):
+        raise ConfigError(f"{what} has no method rank(context)")
+    try:
+        inspect.signature(rank).bind(None)
+    except TypeError as error:
+        taken = f"{what}.rank{inspect.signature(rank)}"
+        raise ConfigError(f"{taken} must take one argument, the context") from error
+    if getattr(policy, "name", None) != name:
+        raise ConfigError(f"{what}.name is {getattr(policy, 'name', None)!r}, must be {name!r}")
+    return policy
+
+
+_PLUGINS = PluginGroup("engram.policies", "ranking policy", _made)
 
 
 def check_for_robot(name: str) -> None:

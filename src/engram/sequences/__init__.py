@@ -2,9 +2,18 @@
 
 from engram.sequences.bags import BagSequence
 from engram.sequences.framelog import FrameLog, FrameLogHeader, FrameLogWriter
-from engram.sequences.image_sequence import ImageSequence
-from engram.sequences.opening import SEQUENCES, Drive, open_sequence, stamps_of
-from engram.sequences.options import FrameRange, TimeRange
+from engram.sequences.image_sequence import ImageDrive, ImageSequence
+from engram.sequences.opening import (
+    SEQUENCES,
+    Drive,
+    SequenceFormat,
+    layout_named,
+    layout_names,
+    open_images,
+    open_sequence,
+    stamps_of,
+)
+from engram.sequences.options import FrameRange, OpenOptions, TimeRange
 from engram.sequences.sequence import (
     FrameSequence,
     LoggedFrame,
@@ -24,13 +33,19 @@ __all__ = [
     "FrameLogWriter",
     "FrameRange",
     "FrameSequence",
+    "ImageDrive",
     "ImageSequence",
     "LoggedFrame",
+    "OpenOptions",
+    "SequenceFormat",
     "SequenceInfo",
     "StereoSequence",
     "TimeRange",
     "check_name",
     "first_pair_hash",
+    "layout_named",
+    "layout_names",
+    "open_images",
     "open_sequence",
     "session_of",
     "stamps_of",

@@ -1,4 +1,8 @@
-"""Opens a drive of any layout: the table of known layouts and `open_sequence`."""
+"""Opens a drive of any layout: the table of known layouts and `open_sequence`.
+
+Other packages add layouts by entry points of the group `engram.readers` that name a
+`SequenceFormat`.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,7 @@ from types import MappingProxyType
 from typing import Any, TypeAlias, TypedDict, Unpack
 
 from engram.errors import ConfigError, SequenceError
+from engram.plugins import PluginGroup, check_is
 from engram.sequences.bags import BagSequence, is_bag, open_bag
 from engram.sequences.clocks import StampReport
 from engram.sequences.euroc import find_euroc, find_tumvi, is_euroc, is_tumvi
@@ -67,7 +72,7 @@ class SequenceFormat:
     Attributes:
         looks_like: what a path must hold, as text.
         recognises: whether a path has this layout; checks names only.
-        open: opens it.
+        open: opens it; `open_images` makes it for layouts of image files.
         rigs: the rigs it can have.
         has_topics: whether its images are named by topics.
     """
@@ -79,9 +84,10 @@ class SequenceFormat:
     has_topics: bool = False
 
 
-def _images(
+def open_images(
     find: Callable[[Path, OpenOptions], ImageDrive],
 ) -> Callable[[Path, OpenOptions], ImageSequence]:
+    """What opens a layout of image files, by the function that finds them."""
     return lambda path, options: ImageSequence(find(path, options), options)
 
 
@@ -90,34 +96,34 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
         "kitti": SequenceFormat(
             "KITTI odometry, sequences/NN with image_0/, image_1/, calib.txt, times.txt",
             is_kitti_odometry,
-            _images(find_kitti_odometry),
+            open_images(find_kitti_odometry),
             (Rig.GREY, Rig.COLOUR),
         ),
         "kitti-raw": SequenceFormat(
             "KITTI raw, DATE_drive_NNNN_sync with image_00/data/, image_00/timestamps.txt, …",
             is_kitti_raw,
-            _images(find_kitti_raw),
+            open_images(find_kitti_raw),
             (Rig.GREY, Rig.COLOUR),
         ),
         "euroc": SequenceFormat(
             "EuRoC / ASL, mav0/cam0/{data/,data.csv,sensor.yaml} and mav0/cam1 likewise",
             is_euroc,
-            _images(find_euroc),
+            open_images(find_euroc),
         ),
         "folder": SequenceFormat(
             "plain folder, left/, right/ (or both/), calibration.toml and perhaps times.txt",
             is_folder,
-            _images(find_folder),
+            open_images(find_folder),
         ),
         "tum-vi": SequenceFormat(
             "TUM-VI, mav0/cam0 and mav0/cam1 as in EuRoC, with dso/camchain.yaml beside mav0",
             is_tumvi,
-            _images(find_tumvi),
+            open_images(find_tumvi),
         ),
         "robotcar": SequenceFormat(
             "Oxford RobotCar, stereo/left/ and stereo/right/, models/ there or above",
             is_robotcar,
-            _images(find_robotcar),
+            open_images(find_robotcar),
         ),
         "bag": SequenceFormat(
             "ROS bag, a file NAME.bag, NAME.mcap or NAME.db3, or a folder of them",
@@ -147,7 +153,7 @@ def open_sequence(
 
     Args:
         path: folder or file of the drive.
-        format: key of `SEQUENCES`; None recognises the layout by its files.
+        format: one of `layout_names()`; None recognises the layout by its files.
         **given: see `OpenArguments`.
 
     Raises:
@@ -157,10 +163,11 @@ def open_sequence(
         ConfigError: an argument is out of range or does not fit the layout.
         MapError: a frame log is damaged, locked, or of a newer format.
         MissingExtraError: it is a bag, and the extra `bags` is not installed.
+        IncompatibleError: another package adds a layout, and it cannot be used.
     """
     path, options = Path(path), options_of(**given)
-    name = recognise(path) if format is None else _known(format)
-    layout = SEQUENCES[name]
+    name = recognise(path) if format is None else format
+    layout = layout_named(name)
     if options.rig not in layout.rigs:
         raise ConfigError(
             f"{path}: layout {name!r} has no rig {options.rig.value!r}, only "
@@ -169,6 +176,34 @@ def open_sequence(
     if not layout.has_topics and {options.left, options.right} != {None}:
         raise ConfigError(f"{path}: --left and --right name topics of a bag; this is {name!r}")
     return layout.open(path, options)
+
+
+def layout_names() -> list[str]:
+    """The names of all layouts: Engram's own, then those that other packages add."""
+    return [*SEQUENCES, *(name for name in _PLUGINS.names() if name not in SEQUENCES)]
+
+
+def layout_named(name: str) -> SequenceFormat:
+    """The layout of that name.
+
+    Raises:
+        ConfigError: the name is unknown; the message lists the known ones.
+        IncompatibleError: another package adds it, and it cannot be used.
+    """
+    if name in SEQUENCES:
+        return SEQUENCES[name]
+    if name in _PLUGINS.names():
+        return _PLUGINS.load(name)
+    raise ConfigError(f"format {name!r} is unknown; known are\n{_known_layouts()}")
+
+
+_PLUGINS = PluginGroup(
+    "engram.readers", "reader of drives", lambda _, found: check_is(found, SequenceFormat)
+)
+
+
+def _layouts() -> dict[str, SequenceFormat]:
+    return {name: layout_named(name) for name in layout_names()}
 
 
 class OpenArguments(TypedDict, total=False):
@@ -244,16 +279,17 @@ _PARSERS: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
 
 
 def recognise(path: Path) -> str:
-    """The key in `SEQUENCES` of the layout found at a path.
+    """The name of the layout found at a path.
 
     Raises:
         SequenceError: there is nothing, no known layout, or more than one.
+        IncompatibleError: another package adds a layout, and it cannot be used.
     """
     if path.suffix == ".engram":
         raise SequenceError(f"{path}: is the name of a map, not of a drive; the map is given first")
     if not path.exists():
         raise SequenceError(f"{path}: there is no such file or folder")
-    found = [name for name, layout in SEQUENCES.items() if layout.recognises(path)]
+    found = [name for name, layout in _layouts().items() if layout.recognises(path)]
     if len(found) == 1:
         return found[0]
     if found:
@@ -301,17 +337,18 @@ def drives_inside(path: Path) -> list[Path]:
 
     KITTI keeps them in `sequences/NN` and `DATE/DATE_drive_NNNN_sync`.
     """
+    layouts = _layouts().values()
+
+    def is_drive(path: Path) -> bool:
+        return any(layout.recognises(path) for layout in layouts)
+
     found: list[Path] = []
     for child in _entries(path):
-        if _is_drive(child):
+        if is_drive(child):
             found.append(child)
         elif not child.name.startswith("."):
-            found += filter(_is_drive, _entries(child))
+            found += filter(is_drive, _entries(child))
     return found
-
-
-def _is_drive(path: Path) -> bool:
-    return any(layout.recognises(path) for layout in SEQUENCES.values())
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -322,11 +359,5 @@ def _entries(folder: Path) -> list[Path]:
         return []
 
 
-def _known(name: str) -> str:
-    if name not in SEQUENCES:
-        raise ConfigError(f"format {name!r} is unknown; known are\n{_known_layouts()}")
-    return name
-
-
 def _known_layouts() -> str:
-    return "\n".join(f"  {name}: {layout.looks_like}" for name, layout in SEQUENCES.items())
+    return "\n".join(f"  {name}: {layout.looks_like}" for name, layout in _layouts().items())

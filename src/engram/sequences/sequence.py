@@ -25,7 +25,7 @@ class SequenceInfo:
 
     Attributes:
         name: short display name, from the path.
-        format: key in `SEQUENCES`, such as "kitti".
+        format: the layout's name, such as "kitti".
         clock: meaning of the stamps.
         robot: name of the robot, if the source gives one.
         longitude_deg, zone: where the drive was, if known (method §2.8).

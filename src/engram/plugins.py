@@ -1,0 +1,91 @@
+"""What other installed packages add to Engram, by entry points.
+
+A package names a ranking policy, a reader of drives, a kind of features or a verb in its
+`pyproject.toml`. Whatever comes in is checked where it is loaded. `examples/` has one of each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Generic, TypeVar
+
+from engram.errors import ConfigError, EngramError, IncompatibleError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class PluginGroup(Generic[T]):
+    """One kind of thing that packages add.
+
+    Attributes:
+        group: its group of entry points, such as "engram.policies".
+        what: what one of them is called in messages.
+        accept: makes the usable thing of an entry's name and the object that it names. Raises a
+            ConfigError that says what is wrong with an object that does not fit.
+    """
+
+    group: str
+    what: str
+    accept: Callable[[str, Any], T]
+
+    def names(self) -> list[str]:
+        """The names that packages add, sorted; nothing is imported."""
+        return sorted({entry.name for entry in self._entries()})
+
+    def load(self, name: str) -> T:
+        """The thing of one of `names()`.
+
+        Raises:
+            IncompatibleError: its package cannot be imported, or what it names does not fit; or
+                several packages add that name.
+        """
+        entries = [entry for entry in self._entries() if entry.name == name]
+        if len(entries) > 1:
+            packages = " and ".join(sorted(_package(entry) for entry in entries))
+            raise IncompatibleError(
+                f"{self.what} {name!r} is added by {packages}; uninstall all but one of them"
+            )
+        (entry,) = entries
+        try:
+            return self.accept(name, entry.load())
+        except Exception as error:  # the code of others may fail in any way
+            reason = str(error) if isinstance(error, EngramError) else _named(error)
+            raise IncompatibleError(
+                f"{self.what} {name!r} of {_package(entry)} cannot be used: {reason}; mend that "
+                "package or uninstall it"
+            ) from error
+
+    def _entries(self) -> list[EntryPoint]:
+        return list(_installed().select(group=self.group))
+
+
+def check_is(found: object, kind: type[T]) -> T:
+    """The object, if it is of that kind.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if isinstance(found, kind):
+        return found
+    raise ConfigError(
+        f"{found!r} is of type {type(found).__name__}, must be {kind.__module__}.{kind.__name__}"
+    )
+
+
+@cache
+def _installed() -> Any:
+    """All entry points of this environment: one search for all groups."""
+    return entry_points()
+
+
+def _package(entry: EntryPoint) -> str:
+    """Name and version of the distribution that an entry belongs to."""
+    return "a package" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
+
+
+def _named(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
