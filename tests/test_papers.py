@@ -14,7 +14,7 @@ from tests.fleet.robots import OPTIONS, merged, robot_map
 from tests.fleet.test_updating import Content
 from tests.mapping_rig import localised, map_simulated
 from tests.synthetic_world import World, drive
-from tests.worlds import covariance_of, forward, make_edge, make_node
+from tests.worlds import covariance_of, forward, make_edge
 
 from engram.cli.fleet import _judge, merging_of
 from engram.cli.options import Effort
@@ -36,6 +36,7 @@ from engram.ranking import POLICIES
 from engram.robot import Settings, load_settings
 from engram.robot.localisers import localiser_in
 from engram.robot.settings import PAPERS
+from engram.testing.situations import make_node
 
 PAGE = Path(__file__).parents[1] / "docs" / "papers.md"
 WORLD = World(30.0)

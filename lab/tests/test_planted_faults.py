@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from tests.fleet.robots import frame_log
-from tests.worlds import make_context
 
 from engram.errors import InputError
 from engram.fleet.build.building import BuildReport
@@ -20,6 +19,7 @@ from engram.graph.model import SessionId, session_id
 from engram.measures import Drive
 from engram.ranking import POLICIES
 from engram.robot import RobotOptions, Settings, open_drive
+from engram.testing.situations import make_context
 from engram_lab import trial
 from engram_lab.checks.planted_faults import FAULTS, planted
 from engram_lab.intervals import beats

@@ -7,11 +7,11 @@ from uuid import UUID
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.worlds import CAMERA
 
 from engram.errors import ConfigError
 from engram.fleet.build.grouping import GROUPINGS, Drive, group_drives
 from engram.graph.model import Clock, Session, SessionId
+from engram.testing.situations import CAMERA
 
 HOUR_NS = 3_600_000_000_000
 

@@ -8,11 +8,11 @@ from itertools import pairwise
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.worlds import CAMERA, session_uuid
 
 from engram.fleet.merge.segments import string_segments
 from engram.geometry import SE3
 from engram.graph.model import Edge, EdgeKind, Node, node_id
+from engram.testing.situations import CAMERA, session_uuid
 
 
 def make_node(session: int, stamp_ns: int) -> Node:

@@ -33,7 +33,6 @@ from engram.frontend import (
     network,
 )
 from engram.frontend.blobs import decode_landmarks, encode_landmarks
-from engram.frontend.contract import check_kind
 from engram.frontend.features import (
     NET,
     describe_brief,
@@ -41,6 +40,7 @@ from engram.frontend.features import (
     detect_corners,
     feature_kind,
     fitted_matcher,
+    known_kinds,
 )
 from engram.geometry import StereoCamera
 from engram.maps import Map
@@ -54,6 +54,7 @@ from engram.places.vocabulary import default_vocabulary
 from engram.robot import Settings
 from engram.robot.recording import extract_log
 from engram.sequences import FrameLog, open_sequence
+from engram.testing import check_kind, unmet
 
 CAMERA = StereoCamera(260.0, 260.0, 160.0, 120.0, 0.2, 320, 240)
 BOTH = DescriptorKind("both")
@@ -61,7 +62,7 @@ STEP_PX = 12  # of the picture, from frame to frame
 DISPARITY_PX = 12
 FRAMES = 6
 STEP_M = CAMERA.baseline_m * STEP_PX / DISPARITY_PX
-KINDS = (BRIEF, TEBLID, NET, BOTH)
+KINDS = (*(kind.name for kind in known_kinds()), BOTH)
 
 
 def describe_both(image: np.ndarray, pixels: np.ndarray, octaves: np.ndarray) -> np.ndarray:
@@ -274,23 +275,9 @@ def test_an_unknown_kind_is_refused_with_the_known_ones() -> None:
         FrontendConfig(descriptor=DescriptorKind("orb"))
 
 
-def test_an_installed_package_brings_a_kind(monkeypatch: pytest.MonkeyPatch) -> None:
-    from engram.frontend import features
-
-    class Entry:
-        name = "brought"
-
-        def load(self) -> FeatureKind:
-            return FeatureKind(DescriptorKind("brought"), 8, detect_corners, describe_both)
-
-    monkeypatch.setattr(features, "_brought", lambda: {"brought": Entry()})
-    monkeypatch.setattr(features, "FEATURES", dict(FEATURES))
-    assert features.feature_kind("brought").descriptor_bytes == 8
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_meets_the_contract(kind: DescriptorKind) -> None:
-    assert [one for one in check_kind(FEATURES[kind]) if not one.met] == []
+    assert unmet(check_kind(FEATURES[kind])) == []
 
 
 def test_a_kind_that_breaks_the_contract_is_found_out() -> None:
@@ -299,8 +286,7 @@ def test_a_kind_that_breaks_the_contract_is_found_out() -> None:
 
     broken = FeatureKind(BOTH, 64, detect_corners, nothing)
     FEATURES[BOTH] = broken
-    demands = [one.demand for one in check_kind(broken) if not one.met]
-    assert [demand.split()[0] for demand in demands] == ["different", "100"]
+    assert [one.split()[0] for one in unmet(check_kind(broken))] == ["different", "100"]
 
 
 def test_a_learned_kind_is_named_with_its_model_and_found_without_it() -> None:

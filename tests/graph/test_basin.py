@@ -6,11 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import isotonic_regression
 from tests.reference import basin as reference
-from tests.worlds import make_node
 
 from engram.errors import InputError
 from engram.graph.basin import BasinCounts, MatchBasin, _falling, count_attempts, prior_basin_m
 from engram.graph.model import Attempt
+from engram.testing.situations import make_node
 
 NODE = make_node(0, 0).id
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.worlds import covariance_of, make_node
+from tests.worlds import covariance_of
 
 from engram.geometry import SE3
 from engram.graph.adjusting import AdjustConfig, Measured, Poses, adjust
@@ -16,6 +16,7 @@ from engram.graph.placing import (
     place,
     replace_after_removal,
 )
+from engram.testing.situations import make_node
 
 SIGMA_M, SIGMA_RAD = 0.01, 0.001
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.mapping_rig import localised, map_simulated
 from tests.synthetic_world import CAMERA, Seen, World, drive, see
-from tests.worlds import covariance_of, forward, make_edge, make_node
+from tests.worlds import covariance_of, forward, make_edge
 
 from engram.geometry import SE3, StereoCamera
 from engram.graph.graph import ExperienceGraph
@@ -20,6 +20,7 @@ from engram.maps import Map
 from engram.ranking import POLICIES
 from engram.robot import Settings
 from engram.robot.localisers import localiser_in
+from engram.testing.situations import make_node
 
 WORLD = World(40.0, seed=3)
 ROAD = np.arange(0.0, 30.0, 0.7)

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.worlds import flat_graph, forward, make_edge
+from tests.worlds import forward, make_edge
 
 from engram.frontend import Match
 from engram.geometry import SE3
@@ -13,6 +13,7 @@ from engram.graph.model import EdgeKind
 from engram.localiser import AcceptanceConfig
 from engram.localiser.attempts import Candidate, Outcome
 from engram.mapper import match_edges
+from engram.testing.situations import flat_graph
 
 
 def chain(nodes: int, step_m: float, sigma_m: float, *, broken_at: int = -1) -> ExperienceGraph:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
-from tests.worlds import forward, make_edge, make_node
+from tests.worlds import forward, make_edge
 
 from engram.geometry import SE3
 from engram.graph.graph import ExperienceGraph
@@ -20,6 +20,7 @@ from engram.localiser.chain import MOST_ON_TRIAL, FixChain
 from engram.mapper import Memory
 from engram.mapper.loops import LoopSearch
 from engram.mapper.saver import Records
+from engram.testing.situations import make_node
 
 CHAIN = 20
 # Of Python's own; an array of one byte per node of the larger map is larger.

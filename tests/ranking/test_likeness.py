@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.worlds import MadeUpWords, flat_graph, make_context
 
 from engram.errors import MapCorruptError
 from engram.frontend import BRIEF, Frame
@@ -15,6 +14,7 @@ from engram.places import default_vocabulary
 from engram.places.words import NodeWords
 from engram.ranking.likeness import likenesses, standard_likenesses
 from engram.ranking.recall import RECALL, RecallPolicy
+from engram.testing.situations import MadeUpWords, flat_graph, make_context
 
 WORDS = st.lists(st.integers(0, 49), max_size=12, unique=True)
 

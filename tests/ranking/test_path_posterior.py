@@ -7,12 +7,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.reference.path_posterior import posterior, prior_of, theta_row
-from tests.worlds import flat_graph, make_context, memory_of, neighbourhood_of, path_uuid
 
 from engram.graph.model import PathEntry, PathEntryKind
 from engram.graph.paths import PathMemory
 from engram.ranking.path import PathPolicy
 from engram.ranking.path_near import PathNearPolicy
+from engram.testing.situations import (
+    flat_graph,
+    make_context,
+    memory_of,
+    neighbourhood_of,
+    path_uuid,
+)
 
 
 def scores_of(memory: PathMemory, candidates, *evidence, **options) -> np.ndarray:

@@ -6,137 +6,67 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.worlds import make_context, neighbourhood_of, path_uuid
 
 from engram.errors import ConfigError
 from engram.graph.basin import BASIN_LEVEL
-from engram.ranking import Foreseen, RankingContext, policy_named, policy_names
+from engram.ranking import Foreseen, policy_named, policy_names
 from engram.ranking.context import order_by
 from engram.ranking.path import PathPolicy
+from engram.testing import check_policy, unmet
+from engram.testing.situations import make_context, random_context
 
-
-@st.composite
-def contexts(draw) -> RankingContext:
-    nodes = draw(st.integers(1, 25))
-    some = st.lists(st.integers(0, nodes - 1), max_size=nodes, unique=True)
-    candidates = draw(some)
-    observed = draw(some)
-    hours = st.none() | st.floats(0, 23.99)
-    words = st.lists(st.integers(0, 9), max_size=5, unique=True).map(sorted)
-    run = st.tuples(
-        st.floats(-50, 0),
-        st.integers(0, nodes - 1),
-        st.sampled_from([0.0, 0.3, 0.9, np.nan]),
-        st.booleans(),
-    )
-    context = make_context(
-        paths=draw(st.lists(some, max_size=8)),
-        candidates=candidates,
-        # Few values, so that ties in distance are common.
-        along_m=[draw(st.sampled_from([-3.0, -0.5, 0.0, 0.5, 1.0, 6.0])) for _ in candidates],
-        observed=observed,
-        outcomes=[draw(st.booleans()) for _ in observed],
-        reference=draw(st.none() | st.integers(0, nodes - 1)),
-        own_path=draw(st.none() | st.just(path_uuid(0))),
-        stamp_ns=draw(st.integers(0, 2**62)),
-        sessions=draw(st.integers(1, 5)),
-        run=sorted(draw(st.lists(run, max_size=12)), key=lambda attempt: attempt[0]),
-        hour=draw(hours),
-        hours=draw(st.lists(hours, max_size=5)),
-        words=draw(st.none() | st.dictionaries(st.integers(0, nodes - 1), words)),
-        live_words=draw(st.none() | words),
-        lessons=draw(
-            st.lists(
-                st.tuples(
-                    st.integers(0, 4),
-                    st.integers(0, nodes - 1),
-                    st.sampled_from([0.0, 0.3, 0.9]),
-                    st.booleans(),
-                ),
-                max_size=12,
-            )
-        ),
-    )
-    return foreknown(context, draw(st.integers(0, 2**32)))
-
-
-def foreknown(context: RankingContext, seed: int = 0) -> RankingContext:
-    """The context with made-up foresight, a property of the node and not of the row."""
-    nodes = context.neighbourhood.nodes
-
-    def tell() -> Foreseen:
-        rng = np.random.default_rng(seed)
-        inliers = rng.integers(0, 4, len(context.graph)) * 10
-        return Foreseen(inliers[nodes] >= 20, inliers[nodes])
-
-    return dataclasses.replace(context, foresee=tell)
+contexts = st.integers(0, 2**32).map(random_context)
 
 
 @pytest.mark.parametrize("name", sorted(policy_names()))
-class TestContract:
-    def test_name_is_the_one_in_the_table(self, name: str) -> None:
-        assert policy_named(name).name == name
+@given(context=contexts)
+@settings(max_examples=25)
+def test_every_policy_meets_the_contract(name: str, context) -> None:
+    assert unmet(check_policy(lambda: policy_named(name), [context])) == []
 
-    @given(context=contexts())
-    @settings(max_examples=25)
-    def test_ranking_is_a_permutation_of_the_rows(self, name: str, context) -> None:
-        order = policy_named(name).rank(context)
-        assert order.dtype == np.int64
-        assert sorted(order.tolist()) == list(range(len(context.neighbourhood)))
 
-    @given(context=contexts(), seed=st.integers(0, 2**32))
-    @settings(max_examples=25)
-    def test_order_of_nodes_does_not_depend_on_the_order_of_rows(
-        self, name: str, context, seed: int
-    ) -> None:
-        shuffle = np.random.default_rng(seed).permutation(len(context.neighbourhood))
-        near = context.neighbourhood
-        shuffled = foreknown(
-            dataclasses.replace(
-                context,
-                neighbourhood=neighbourhood_of(near.nodes[shuffle], near.along_m[shuffle]),
-            )
-        )
-        context = foreknown(context)
-        nodes = near.nodes[policy_named(name).rank(context)]
-        again = shuffled.neighbourhood.nodes[policy_named(name).rank(shuffled)]
-        np.testing.assert_array_equal(nodes, again)
+@pytest.mark.parametrize("name", sorted({*policy_names()} - {"random", "oracle"}))
+def test_a_robot_on_its_first_day_gets_the_nearest_first(name: str) -> None:
+    context = make_context(candidates=[4, 2, 7], along_m=[2.0, 0.5, 1.0], sessions=3)
+    assert policy_named(name).rank(context).tolist() == [1, 2, 0]
 
-    @given(context=contexts())
-    @settings(max_examples=15)
-    def test_one_policy_serves_again_and_gives_the_same(self, name: str, context) -> None:
-        policy = policy_named(name)
-        first = policy.rank(context)
-        policy.rank(foreknown(make_context(candidates=[0, 1, 2], paths=[[0, 1]], reference=1)))
-        np.testing.assert_array_equal(first, policy.rank(context))
 
-    def test_no_candidates_give_an_empty_order(self, name: str) -> None:
-        assert policy_named(name).rank(foreknown(make_context())).shape == (0,)
+def rank_by_row(context):
+    return np.arange(len(context.neighbourhood))
 
-    def test_the_live_path_does_not_count(self, name: str) -> None:
-        situation = {
-            "candidates": [0, 1, 2, 3],
-            "observed": [4, 5, 6],
-            "outcomes": [True, True, False],
-            "reference": 4,
-        }
-        past = [[4, 1, 5], [6, 2]]
-        without = make_context(paths=past, **situation)
-        with_live = make_context(
-            paths=[*past, [4, 3, 5], [4, 3, 5]][:3], own_path=path_uuid(2), **situation
-        )
-        policy = policy_named(name)
-        np.testing.assert_array_equal(
-            policy.rank(foreknown(without)), policy.rank(foreknown(with_live))
-        )
 
-    def test_a_robot_on_its_first_day_gets_an_order(self, name: str) -> None:
-        """No history, clock, words or position: all candidates, and the nearest first."""
-        context = foreknown(make_context(candidates=[4, 2, 7], along_m=[2.0, 0.5, 1.0], sessions=3))
-        order = policy_named(name).rank(context)
-        assert sorted(order.tolist()) == [0, 1, 2]
-        if name not in {"random", "oracle"}:
-            assert order.tolist() == [1, 2, 0]
+def rank_without_the_last(context):
+    return rank_by_row(context)[:-1]
+
+
+def rank_by_the_live_path(context):
+    order = rank_by_row(context)
+    return order if context.own_path is None else order[::-1]
+
+
+def rank_as_a_list(context):
+    return rank_by_row(context).tolist()
+
+
+@pytest.mark.parametrize(
+    ("rank", "demands"),
+    [
+        (rank_by_row, ["nodes come in the same order when rows are shuffled"]),
+        (rank_without_the_last, ["every row", "a robot on its first day", "nodes come"]),
+        (rank_by_the_live_path, ["nodes come", "the robot's own path"]),
+        (rank_as_a_list, ["every row", "no candidates", "a robot on its first day", "nodes come"]),
+    ],
+)
+def test_a_policy_that_breaks_the_contract_is_found_out(rank, demands) -> None:
+    class Policy:
+        name = "broken"
+
+        def rank(self, context):
+            return rank(context)
+
+    found = unmet(check_policy(Policy))
+    assert len(found) == len(demands), found
+    assert all(one.startswith(demand) for one, demand in zip(found, demands, strict=True)), found
 
 
 @pytest.mark.parametrize("name", sorted({*policy_names()} - {"random"}))
@@ -195,7 +125,7 @@ def test_path_near_ranks_by_distance_beyond_the_basin_and_the_published_formula_
     assert policy_named("path-near").rank(make_context(**situation, focal_px=707.0))[0] == 0
 
 
-@given(context=contexts())
+@given(context=contexts)
 @settings(deadline=None)
 def test_path_near_is_the_formula_within_the_basin_and_distance_beyond(context) -> None:
     near = context.neighbourhood

@@ -7,16 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.reference import recall as reference
-from tests.worlds import (
-    flat_graph,
-    forward,
-    lessons_of,
-    make_context,
-    make_edge,
-    memory_of,
-    run_of,
-    session_uuid,
-)
+from tests.worlds import forward, make_edge
 
 from engram import _core
 from engram.graph.attempts import Attempts
@@ -27,6 +18,14 @@ from engram.ranking import Lessons
 from engram.ranking.lessons import UNKNOWN_BASE
 from engram.ranking.recall import RECALL, RecallPolicy
 from engram.ranking.run import RunLog
+from engram.testing.situations import (
+    flat_graph,
+    lessons_of,
+    make_context,
+    memory_of,
+    run_of,
+    session_uuid,
+)
 from engram_lab.bench.synthetic import SyntheticPlace
 
 SESSIONS = 4

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 from tests.fleet.robots import merged, robot_map
-from tests.worlds import covariance_of, forward, make_edge, make_node
+from tests.worlds import covariance_of, forward, make_edge
 
 from engram.fleet.download import DownloadOptions, download
 from engram.graph.marks import Removal, Removed
@@ -13,6 +13,7 @@ from engram.graph.model import Edge, EdgeKind
 from engram.maps import Map, check_file
 from engram.repair import RepairConfig, check_geometry, find_wrong_edges
 from engram.repair.crossings import Crossings
+from engram.testing.situations import make_node
 
 PLACES_M = np.arange(0.0, 30.0, 1.0)
 

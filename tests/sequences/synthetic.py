@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -48,13 +49,22 @@ def write_image(path: Path, image: np.ndarray) -> None:
     path.write_bytes(content.tobytes())
 
 
+# Index of the pair, side → image.
+Picture = Callable[[int, int], np.ndarray]
+
+
+class WriteLayout(Protocol):
+    def __call__(self, root: Path, picture: Picture = picture) -> Path: ...
+
+
 @dataclass(frozen=True)
 class ImageLayout:
     """How a layout lays its files out.
 
     Attributes:
         format: key in `SEQUENCES`.
-        write: writes a drive of `PAIRS` pairs below a folder and gives the path to open.
+        write: writes a drive of `PAIRS` pairs below a folder, of these pictures or others, and
+            gives the path to open.
         image: the path of an image, from the path to open, the pair's index and the side.
         calibration: the calibration file, from the path to open.
         stamps: the file with the stamps of the left images, one line a pair after `head` lines.
@@ -63,7 +73,7 @@ class ImageLayout:
     """
 
     format: str
-    write: Callable[[Path], Path]
+    write: WriteLayout
     image: Callable[[Path, int, int], Path]
     calibration: Callable[[Path], Path]
     stamps: Callable[[Path], Path] | None
@@ -71,7 +81,7 @@ class ImageLayout:
     first_ns: int = START_NS
 
 
-def _write_kitti(root: Path) -> Path:
+def _write_kitti(root: Path, picture: Picture = picture) -> Path:
     path = root / "sequences" / "03"
     for index in range(PAIRS):
         for side in range(2):
@@ -89,7 +99,7 @@ def _kitti_image(path: Path, index: int, side: int) -> Path:
     return path / f"image_{side}" / f"{index:06d}.png"
 
 
-def _write_kitti_raw(root: Path) -> Path:
+def _write_kitti_raw(root: Path, picture: Picture = picture) -> Path:
     path = root / "2014_05_13" / "2014_05_13_drive_0007_sync"
     for side in range(2):
         for index in range(PAIRS):
@@ -123,7 +133,7 @@ distortion_coefficients: [0.0, 0.0, 0.0, 0.0]
 """
 
 
-def _write_euroc(root: Path) -> Path:
+def _write_euroc(root: Path, picture: Picture = picture) -> Path:
     path = root / "V9_01"
     for side in range(2):
         folder = path / "mav0" / f"cam{side}"
@@ -152,7 +162,7 @@ height = 32
 """
 
 
-def _write_folder(root: Path) -> Path:
+def _write_folder(root: Path, picture: Picture = picture) -> Path:
     path = root / "monday"
     for index in range(PAIRS):
         for side in range(2):
@@ -167,7 +177,7 @@ def _folder_image(path: Path, index: int, side: int) -> Path:
     return path / ("left", "right")[side] / f"shot_{index:03d}.png"
 
 
-def _write_stamped_folder(root: Path) -> Path:
+def _write_stamped_folder(root: Path, picture: Picture = picture) -> Path:
     path = root / "tuesday"
     for index in range(PAIRS):
         for side in range(2):

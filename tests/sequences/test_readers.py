@@ -1,10 +1,10 @@
-"""The contract of every reader of images, on the same small drive in each layout."""
+"""The contract of every reader, and how readers of images meet faults, on small drives."""
 
 import shutil
 import struct
 import zlib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -14,9 +14,21 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from engram.errors import CalibrationError, ConfigError, InputError, SequenceError
+from engram.frontend import StereoPair
 from engram.graph.model import Clock
-from engram.sequences import SEQUENCES, ImageSequence, first_pair_hash, open_sequence, session_of
+from engram.sequences import (
+    SEQUENCES,
+    FrameRange,
+    ImageSequence,
+    OpenOptions,
+    first_pair_hash,
+    open_sequence,
+    session_of,
+)
+from engram.sequences.folder import find_folder
 from engram.sequences.images import read_image
+from engram.testing import check_reader, unmet
+from engram.testing.readers import WriteDrive
 
 from .synthetic import (
     HEIGHT,
@@ -25,10 +37,69 @@ from .synthetic import (
     PERIOD_NS,
     WIDTH,
     ImageLayout,
+    logged,
     only_engram_errors,
     picture,
     write_image,
+    write_log,
 )
+from .test_robotcar_tumvi import write_robotcar, write_tumvi
+
+
+def in_layout(layout: ImageLayout) -> WriteDrive:
+    def write(folder: Path, pairs: Sequence[StereoPair]) -> Path:
+        return layout.write(
+            folder, lambda index, side: (pairs[index].left, pairs[index].right)[side]
+        )
+
+    return write
+
+
+def write_bag(folder: Path, pairs: Sequence[StereoPair]) -> Path:
+    bags = pytest.importorskip(
+        "tests.sequences.bag_maker", reason="the extra `bags` is not installed"
+    )
+    with bags.bag(folder / "drive", "mcap") as maker:
+        for pair in pairs:
+            infos = bags.rectified_infos(pair.camera)
+            for topic, image, info in zip(
+                (bags.LEFT, bags.RIGHT), (pair.left, pair.right), infos, strict=True
+            ):
+                maker.image(topic, pair.stamp_ns, image)
+                maker.info(topic.replace("image_raw", "camera_info"), pair.stamp_ns, info)
+    return bags.made(folder / "drive", "mcap")
+
+
+def write_framelog(folder: Path, pairs: Sequence[StereoPair]) -> Path:
+    frames = [logged(index) for index in range(len(pairs))]
+    return write_log(folder / "monday.framelog", frames)
+
+
+# Format, and what writes a small drive of it.
+WRITERS: list[tuple[str, WriteDrive]] = [
+    *((layout.format, in_layout(layout)) for layout in LAYOUTS.values()),
+    ("tum-vi", write_tumvi),
+    ("robotcar", write_robotcar),
+    ("bag", write_bag),
+    ("framelog", write_framelog),
+]
+# Their calibration is not one that Engram could write.
+OWN_CAMERAS = {"tum-vi", "robotcar"}
+
+
+@pytest.mark.parametrize(("name", "write"), WRITERS)
+def test_every_reader_meets_the_contract(name: str, write: WriteDrive) -> None:
+    writes_camera = name not in OWN_CAMERAS
+    checks = check_reader(name, SEQUENCES[name], write, writes_camera=writes_camera)
+    assert unmet(checks) == []
+
+
+@pytest.mark.parametrize("name", list(SEQUENCES))
+def test_every_reader_has_a_drive_for_its_contract(name: str) -> None:
+    assert name in {written for written, _ in WRITERS}, (
+        f"no test reads a drive of the format {name!r}: add what writes a small one to LAYOUTS of "
+        "tests/sequences/synthetic.py if it consists of image files, else to WRITERS here"
+    )
 
 
 @dataclass(frozen=True)
@@ -662,3 +733,32 @@ class TestFirstHour:
         with pytest.raises(SequenceError, match="colour rig"):
             open_sequence(path, rig="color")
         assert isinstance(open_sequence(path, rig="gray", channel="gray"), ImageSequence)
+
+
+def _folder(path: Path, frames: FrameRange) -> ImageSequence:
+    return ImageSequence(find_folder(path, OpenOptions(frames=frames)), OpenOptions(frames=frames))
+
+
+def _swapped(path: Path, options: OpenOptions) -> ImageSequence:
+    found = find_folder(path, options)
+    places = [
+        one if isinstance(one, str) else replace(one, left=one.right, right=one.left)
+        for one in found.places
+    ]
+    return ImageSequence(replace(found, places=places), options)
+
+
+@pytest.mark.parametrize(
+    ("broken", "demand"),
+    [
+        ({"recognises": lambda path: True}, "other files and folders"),
+        ({"recognises": lambda path: False}, "it is recognised"),
+        ({"open": lambda path, options: _folder(path, FrameRange())}, "--frames"),
+        ({"open": _swapped}, "images are"),
+        ({"open": SEQUENCES["euroc"].open}, "all pairs"),
+    ],
+)
+def test_a_reader_that_breaks_the_contract_is_found_out(broken: dict, demand: str) -> None:
+    layout = replace(SEQUENCES["folder"], **broken)
+    found = unmet(check_reader("folder", layout, in_layout(LAYOUTS["folder"])))
+    assert any(one.startswith(demand) for one in found), found

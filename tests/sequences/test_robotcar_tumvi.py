@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -10,23 +11,37 @@ import numpy as np
 import pytest
 
 from engram.errors import CalibrationError, SequenceError
+from engram.frontend import StereoPair
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Clock
 from engram.sequences import ImageSequence, open_sequence, session_of
 
-from .synthetic import HEIGHT, WIDTH, picture, write_image
+from .synthetic import HEIGHT, WIDTH, camera, picture, write_image
 
 START_US = 1_400_505_794_000_000  # 2014-05-19 13:23 UTC
 PAIRS = 5
 
 
-def write_robotcar(folder: Path, shift_px: float = 2.0) -> Path:
+def pairs_from(start_ns: int, period_ns: int, sigma_px: float = 0.01) -> list[StereoPair]:
+    return [
+        StereoPair(
+            start_ns + index * period_ns,
+            *(cv2.GaussianBlur(picture(index, side), (0, 0), sigma_px) for side in range(2)),
+            camera(),
+        )
+        for index in range(PAIRS)
+    ]
+
+
+def write_robotcar(
+    folder: Path, pairs: Sequence[StereoPair] | None = None, shift_px: float = 2.0
+) -> Path:
     """A traversal whose tables shift the images by some pixels."""
     path = folder / "2014-05-19-13-20-57"
-    for index in range(PAIRS):
-        for side, name in enumerate(("left", "right")):
-            image = cv2.GaussianBlur(picture(index, side), (0, 0), 3)
-            write_image(path / "stereo" / name / f"{START_US + index * 62_500}.png", image)
+    for pair in pairs or pairs_from(START_US * 1000, 62_500_000, sigma_px=3):
+        for side in ("left", "right"):
+            file = path / "stereo" / side / f"{pair.stamp_ns // 1000}.png"
+            write_image(file, getattr(pair, side))
     models = folder / "models"
     models.mkdir()
     columns, rows = np.meshgrid(np.arange(WIDTH, dtype=float), np.arange(HEIGHT, dtype=float))
@@ -109,21 +124,25 @@ cam1:
 """
 
 
+def write_tumvi(folder: Path, pairs: Sequence[StereoPair] | None = None) -> Path:
+    path = folder / "dataset-room1_512_16"
+    pairs = pairs or pairs_from(1_520_530_308_199_447_626, 50_000_000)
+    for side, name in enumerate(("left", "right")):
+        folder = path / "mav0" / f"cam{side}"
+        for pair in pairs:
+            image = getattr(pair, name).astype(np.uint16) * 257
+            write_image(folder / "data" / f"{pair.stamp_ns}.png", image)
+        lines = "\n".join(f"{pair.stamp_ns},{pair.stamp_ns}.png" for pair in pairs)
+        (folder / "data.csv").write_text(f"#timestamp [ns],filename\n{lines}\n")
+    (path / "dso").mkdir()
+    (path / "dso" / "camchain.yaml").write_text(CAMCHAIN)
+    return path
+
+
 class TestTumVi:
     @pytest.fixture
     def path(self, tmp_path: Path) -> Path:
-        path = tmp_path / "dataset-room1_512_16"
-        for side in range(2):
-            folder = path / "mav0" / f"cam{side}"
-            stamps = [1_520_530_308_199_447_626 + 50_000_000 * index for index in range(PAIRS)]
-            for index, stamp in enumerate(stamps):
-                image = picture(index, side).astype(np.uint16) * 257
-                write_image(folder / "data" / f"{stamp}.png", image)
-            lines = "\n".join(f"{stamp},{stamp}.png" for stamp in stamps)
-            (folder / "data.csv").write_text(f"#timestamp [ns],filename\n{lines}\n")
-        (path / "dso").mkdir()
-        (path / "dso" / "camchain.yaml").write_text(CAMCHAIN)
-        return path
+        return write_tumvi(tmp_path)
 
     def test_it_is_told_from_euroc_and_rectified_to_a_pinhole(self, path: Path) -> None:
         drive = open_sequence(path, field_of_view_deg=80.0)

@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.worlds import make_context
 
 from engram.ranking import Foreseen, policy_named
 from engram.ranking.recall import RECALL
+from engram.testing.situations import make_context
 from engram_lab.fits import recall
 
 

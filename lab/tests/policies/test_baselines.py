@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.worlds import flat_graph, make_context, memory_of, run_of, session_uuid
 
 from engram.errors import ConfigError
 from engram.graph.model import PathEntry, PathEntryKind, path_id
 from engram.ranking import Foreseen, policy_named, policy_names
 from engram.robot import RobotOptions
+from engram.testing.situations import flat_graph, make_context, memory_of, run_of, session_uuid
 from engram_lab.policies.bandit import session_tallies
 from engram_lab.policies.time_of_day import TimeOfDayPolicy
 

@@ -39,8 +39,8 @@ def features(
       engram features list
       engram features check net
     """
-    from engram.frontend.contract import check_kind
     from engram.frontend.features import feature_kind, known_kinds
+    from engram.testing.features import check_kind
 
     asked = [feature_kind(name) for name in kinds] if kinds else known_kinds()
     if action is FeaturesAction.LIST:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +11,7 @@ from engram.frontend.frame import BRIEF, Frame, StereoPair
 from engram.frontend.frontend import Frontend, FrontendConfig
 from engram.frontend.matching import MatcherConfig, match_frames
 from engram.geometry import StereoCamera
+from engram.testing.checks import Check
 
 _CAMERA = StereoCamera(260.0, 260.0, 160.0, 120.0, 0.2, 320, 240)
 _STEP_PX, _DISPARITY_PX = 12, 12
@@ -21,21 +20,6 @@ _WITHIN_M = 0.02
 # Less and all corners look alike.
 _LEAST_DIFFERENT = 0.25
 _FEWEST_INLIERS = 100
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One demand on a kind.
-
-    Attributes:
-        demand: in words.
-        met: whether the kind meets it.
-        found: what it does.
-    """
-
-    demand: str
-    met: bool
-    found: str
 
 
 def check_kind(kind: FeatureKind) -> list[Check]:
