@@ -22,7 +22,6 @@ from engram.robot import RobotOptions, Settings, open_drive
 from engram.testing.situations import make_context
 from engram_lab import trial
 from engram_lab.checks.planted_faults import FAULTS, planted
-from engram_lab.intervals import beats
 from engram_lab.studies.fleet.results import Parallel, Time
 from engram_lab.studies.fleet.trials import _united
 
@@ -51,7 +50,6 @@ def test_maps_are_compared_up_to_twenty_metres():
         for gap, count in (("." * 10 + "x", 5), ("." * 13 + "x", 1))
     )
     assert "within 1" in what_is_worse([once], [often])
-    assert not beats([once], [often])
 
 
 def test_parallel_time_is_that_of_the_slowest_group():

@@ -51,7 +51,8 @@ class Panel:
         title, x_label, y_label: words beside it.
         lines: what is drawn.
         x_ticks: places of ticks and what stands there; None for Matplotlib's own.
-        least_y: the ordinate is logarithmic from here on; None for a linear one.
+        least_y: the ordinate is logarithmic from here on, if anything lies above; None for a linear
+            one.
         signed: whether values below 0 are usual; else a linear ordinate begins at 0.
     """
 
@@ -125,14 +126,15 @@ def _draw_line(axes: Any, line: Line, colour: str, style: str, band: float) -> A
 
 
 def _draw_axes(axes: Any, panel: Panel) -> None:
-    if panel.least_y is not None:
+    if panel.least_y is not None and any((line.y > panel.least_y).any() for line in panel.lines):
         axes.set_yscale("log", nonpositive="clip")
         axes.set_ylim(panel.least_y, None)
         axes.yaxis.set_major_formatter("{x:g}")  # 100, 10, 1 rather than powers of ten
     elif panel.signed:
         axes.axhline(0.0, color="grey", linewidth=0.8)
     else:
-        axes.set_ylim(0, None)
+        highest = max((float(line.y.max(initial=0)) for line in panel.lines), default=0)
+        axes.set_ylim(0, None if highest > 0 else 1)
     if panel.x_ticks is not None:
         axes.set_xticks([at for at, _ in panel.x_ticks], [text for _, text in panel.x_ticks])
     axes.set_title(panel.title, fontsize=10)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.measures import Drive, failure, longest_gap_m
+from engram.measures import Drive
 
 Array = NDArray[np.float64]
 # (N, S) weights of the sessions → (N,) values.
@@ -26,12 +26,6 @@ Statistic: TypeAlias = Callable[[Array], Array]
 LEVEL = 0.9
 
 
-# Source: method §8: P_A ≤ P_B up to 20 m, and A's longest gap at most 1.5 times B's.
-_UP_TO_M = 20.0
-_STEP_M = 0.5
-_LONGEST_GAP_RATIO = 1.5
-
-
 @dataclass(frozen=True, slots=True)
 class Interval:
     """An estimate and the ends of its confidence interval."""
@@ -39,6 +33,13 @@ class Interval:
     estimate: float
     low: float
     high: float
+
+    @property
+    def lower(self) -> bool | None:
+        """Whether a difference is below 0; None if its interval does not lie clear of 0."""
+        if self.high < 0:
+            return True
+        return False if self.low > 0 else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,17 +156,6 @@ def not_localised_sums(drives: Sequence[Drive]) -> SessionSums:
     missed_m = [float(one.step_m[~one.matched].sum()) for one in drives]
     driven_m = [float(one.step_m.sum()) for one in drives]
     return SessionSums(np.array(missed_m, np.float64), np.array(driven_m, np.float64))
-
-
-def beats(a: Sequence[Drive], b: Sequence[Drive]) -> bool:
-    """Whether A beats B (method §8); equal results beat each other.
-
-    A's failure curve is nowhere above B's up to 20 m, and its longest gap is at most 1.5 times B's.
-    """
-    at_m = np.arange(0.0, _UP_TO_M + _STEP_M / 2, _STEP_M)
-    # Sums of the same gaps in another order differ in the last bits.
-    below = failure(a, at_m) <= failure(b, at_m) + 1e-12
-    return bool(below.all()) and longest_gap_m(a) <= _LONGEST_GAP_RATIO * longest_gap_m(b)
 
 
 def _divided(above: Array, below: Array) -> Array:

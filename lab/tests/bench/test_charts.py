@@ -48,3 +48,14 @@ def test_many_labels_get_other_line_styles_and_begin_anew(
     assert shown["10"] == ("black", "-")
     assert shown["11"] == ("C0", "--")
     assert shown["33"] == ("C0", "-")
+
+
+def test_a_logarithmic_panel_without_anything_above_its_least_value_is_drawn(
+    tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    zeros = Line("nothing missed", np.arange(3.0), np.zeros(3))
+    some = Line("something missed", np.arange(3.0), np.array([100.0, 1.0, 0.0]))
+    for lines in ([zeros], [zeros, some]):
+        draw_curves([Panel("", "", "", lines, least_y=0.01)], tmp_path / "a.png", "")
+    draw_curves([Panel("", "", "", [zeros])], tmp_path / "a.png", "")
+    assert [str(one.message) for one in recwarn.list] == []

@@ -29,7 +29,7 @@ from engram_lab.studies import (
 from engram_lab.studies.configurations import map_sizes, sweep
 from engram_lab.studies.lockstep import Runs
 from engram_lab.studies.ranking_figures import POLICY_COLOURS, draw_figures
-from engram_lab.studies.ranking_rows import summary_rows
+from engram_lab.studies.ranking_rows import labelled, policy_rows, summary_rows
 from engram_lab.studies.store import only, read_runs, write_runs
 from engram_lab.studies.summary import collect
 
@@ -100,8 +100,11 @@ def plan(tmp_path_factory, monkeypatch_module=None) -> Plan:
 @pytest.fixture(scope="module")
 def out(plan: Plan, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("out")
-    files = write_report(out, [plan])
-    assert sorted(files) == sorted(out.iterdir())
+    report = write_report(out, [plan])
+    assert sorted(report.files) == sorted(out.iterdir())
+    shown = [line.split() for line in report.text.splitlines()]
+    assert ["policy", "route", "not", "localised", "P(>", "10", "m)", "beats", "distance"] in shown
+    assert {*MISSES} <= {words[0] for words in shown if words[-1:] in (["yes"], ["–"])}
     return out
 
 
@@ -282,7 +285,7 @@ def test_what_was_not_run_is_left_out(plan: Plan, tmp_path: Path, policy: str) -
         for session in fold.held_out:
             only = [Configuration(policy, 2), Configuration(policy, UNLIMITED)]
             write_runs(bare.runs_path(session, "memo"), made_up_runs(session, only))
-    files = {path.name for path in write_report(tmp_path / "out", [bare])}
+    files = {path.name for path in write_report(tmp_path / "out", [bare]).files}
     assert "fig11_lanes.png" in files
     assert not {"fig09_map_size.png", "fig10_candidates.png", "fig13_T.png"} & files
 
@@ -319,6 +322,31 @@ def with_runs(plan: Plan, work: Path, mode: str, run: dict[int, tuple[str, ...]]
         configurations = [Configuration(one, 2) for one in policies]
         write_runs(other.runs_path(session, mode), made_up_runs(session, configurations))
     return other
+
+
+def test_policies_beat_distance_only_where_the_interval_lies_below_0(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(MISSES, "path", MISSES["distance"])
+    monkeypatch.setitem(MISSES, "random", 0.4)
+    policies = ("distance", "recall", "path", "random")
+    held_out = [session for fold in plan.folds for session in fold.held_out]
+    made = with_runs(plan, tmp_path / "work", "memo", dict.fromkeys(held_out, policies))
+    made = replace(made, options=replace(made.options, policies=policies))
+    found = collect(made)
+    rows = policy_rows(found, labelled(found, summary_rows(found)))
+    assert {row["label"]: row["beats_distance"] for row in rows} == {
+        "distance": "",
+        "recall": "yes",
+        "path": "no difference shown",
+        "random": "no",
+    }
+
+
+def test_logs_of_ones_own_are_named_after_the_first_and_the_last(tmp_path: Path) -> None:
+    drives = tuple(replace(made_up_drive(0), path=tmp_path / f"{day}.framelog") for day in "ab")
+    assert DriveSet.of(drives).name == "a-to-b"
+    assert DriveSet.of((made_up_drive(0), made_up_drive(1))).name == Path.cwd().name
 
 
 def test_policies_run_on_different_sessions_are_not_compared(plan: Plan, tmp_path: Path) -> None:

@@ -219,7 +219,7 @@ def test_folds_may_be_run_one_after_another(campaign, plan: Plan, tmp_path: Path
     run(first)
     held_out = {session for session, _ in results(first)}
     assert held_out == set(first.folds[1].held_out)
-    assert write_report(tmp_path / "part", [first])
+    assert write_report(tmp_path / "part", [first]).files
     run(make_plan(campaign, Settings(), few_options(), tmp_path))
     assert results(first) == results(plan)
     with pytest.raises(ConfigError, match="numbered from 0"):
@@ -235,7 +235,7 @@ def test_a_report_has_every_table_and_figure(plan: Plan, tmp_path: Path) -> None
     )
     whole = replace(plan, options=options, work=work)
     run(whole)
-    files = {path.name for path in write_report(tmp_path / "out", [whole])}
+    files = {path.name for path in write_report(tmp_path / "out", [whole]).files}
     assert {"summary.csv", "sessions.csv", "configuration.json", "report.md"} <= files
     assert {name.split("_")[0] for name in files if name.endswith(".png")} == {
         "fig09",
@@ -290,7 +290,8 @@ def test_logs_without_truth_are_localised_and_have_no_errors(tmp_path: Path) -> 
         rows = [row for row in csv.DictReader(file) if row["fold"] == "all"]
     assert all(row["median_error_m"] == row["false_successes"] == "" for row in rows)
     assert all(0 < float(row["share_not_localised"]) < 0.6 for row in rows if row["lanes"] == "2")
-    assert "no truth" in (tmp_path / "out" / "report.md").read_text()
+    page = (tmp_path / "out" / "report.md").read_text()
+    assert "The truth of NAME.framelog is NAME.truth.txt beside it, in TUM format." in page
 
 
 def test_a_drive_with_truth_among_others_without_is_localised(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from engram.errors import InputError
 from engram.geometry import SE3
 from engram.measures import FORMULAS, Drive, Estimator, failure, failure_sums, gaps
 from engram_lab.accuracy import pose_errors
-from engram_lab.intervals import beats
 
 
 def drive(marks: str, step_m: float = 1.0) -> Drive:
@@ -54,18 +53,6 @@ def test_nothing_driven_has_no_failures() -> None:
     nothing = Drive(np.zeros(0), np.zeros(0, bool))
     assert failure([], np.array([1.0]))[0] == 0
     assert failure([nothing], np.array([1.0]))[0] == 0
-
-
-def test_beats_needs_the_curve_below_and_no_much_longer_gap() -> None:
-    often, seldom = drive("x.x.x.x.x.x."), drive("x..x..x..x..")
-    assert beats([often], [seldom])
-    assert not beats([seldom], [often])
-    assert beats([often], [often])
-    # Better everywhere up to 20 m, yet once lost for far longer: 40 m against 22 m.
-    once = drive("x" * 1000 + "." * 39 + "x")
-    many = drive(("x" + "." * 21) * 40 + "x")
-    assert not beats([once], [many])
-    assert beats([drive("x" * 1000 + "." * 32 + "x")], [many])  # 33 m are 1.5 times 22 m
 
 
 def test_pose_errors_are_metres_and_angles() -> None:

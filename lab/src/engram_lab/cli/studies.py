@@ -92,7 +92,7 @@ class _Study:
         folder = self.campaigns or campaigns_folder()
         sets = [open_campaign(name, folder, Size.named(self.size), settings) for name in names]
         if logs:
-            sets.append(DriveSet(logs[0].resolve().parent.name or "logs", drives_of(logs)))
+            sets.append(DriveSet.of(drives_of(logs)))
         return sets
 
     @property
@@ -238,7 +238,10 @@ def ranking(
     for plan in [] if study.report_only else plans:
         forget(plan, again)
         run(plan, study.workers, Bars())
-    study.tell(write_report(out, plans), started)
+    report = write_report(out, plans)
+    if not study.as_json:
+        typer.echo(report.text)
+    study.tell(report.files, started)
 
 
 @evaluate.command("fleet")

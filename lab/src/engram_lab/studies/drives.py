@@ -107,6 +107,17 @@ class DriveSet:
     name: str
     drives: tuple[EvaluatedDrive, ...]
 
+    @staticmethod
+    def of(drives: tuple[EvaluatedDrive, ...]) -> DriveSet:
+        """Drives of one's own, named after the first and the last.
+
+        Names that are mere numbers say nothing; their folder's does.
+        """
+        first, last = (drives[at].path for at in (0, -1))
+        if first.stem.isdecimal():
+            return DriveSet(first.resolve().parent.name or "logs", drives)
+        return DriveSet(f"{first.stem}-to-{last.stem}", drives)
+
     @property
     def has_truth(self) -> bool:
         """Whether all drives have their truth beside them."""

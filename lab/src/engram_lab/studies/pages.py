@@ -97,6 +97,14 @@ def table(
         yield from ("", beside, "") if beside else ("",)
 
 
+def plain_table(rows: Sequence[Row], columns: Mapping[str, str]) -> Iterator[str]:
+    """Lines of some columns for a terminal, by name and heading."""
+    cells = [[*columns.values()], *([cell(row, name) for name in columns] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for line in cells:
+        yield "  ".join(map(str.ljust, line, widths)).rstrip()
+
+
 def pivot(rows: Iterable[Row], index: str, across: str, value: str) -> list[Row]:
     """One row per value of `index`, one column per value of `across`, in order of appearance."""
     found: dict[Any, Row] = {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from engram_lab.studies.pages import (
     compared,
     make_folder,
     pivot,
+    plain_table,
     rated,
     table,
     write_study,
@@ -41,6 +42,7 @@ from engram_lab.studies.ranking_rows import (
 )
 from engram_lab.studies.running import Plan
 from engram_lab.studies.summary import CampaignResult, ConfigurationResult, collect
+from engram_lab.truth import TRUTH_SUFFIX
 
 # Shares as low as this differ by less than anyone would notice: added to both sides of ratios to
 # the oracle.
@@ -50,6 +52,10 @@ _BEST_KNOWN = "recall"
 _USED = {one.name for one in fields(Settings)} | {"drive"}
 # So many map sizes are shown, evenly over those that there are.
 _SHOWN_SIZES = 8
+_NO_TRUTH = (
+    "Not every drive has its truth: no pose errors, no false successes. The truth of NAME.framelog "
+    f"is NAME{TRUTH_SUFFIX} beside it, in TUM format."
+)
 _POLICY_COLUMNS = {
     "label": "policy",
     "p_gt_10m": "P(> 10 m)",
@@ -64,17 +70,29 @@ _POLICY_COLUMNS = {
     "median_error_deg": "°",
     "beats_distance": "beats distance",
 }
+# What a terminal shows of them.
+_FEW_COLUMNS = ("label", "share_not_localised", "p_gt_10m", "beats_distance")
 
 
-def write_report(out: Path, plans: Sequence[Plan]) -> list[Path]:
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What was written of a study.
+
+    Attributes:
+        files: the files.
+        text: the main result, for a terminal.
+    """
+
+    files: list[Path]
+    text: str
+
+
+def write_report(out: Path, plans: Sequence[Plan]) -> Report:
     """Everything that an evaluation of ranking policies leaves in its folder.
 
     Args:
         out: the folder; made if need be, files in it are replaced.
         plans: one per campaign.
-
-    Returns:
-        The files written.
 
     Raises:
         InputError: nothing was run of a campaign, or the folder cannot be written.
@@ -93,13 +111,21 @@ def write_report(out: Path, plans: Sequence[Plan]) -> list[Path]:
         "sessions": [row for one in campaigns for row in session_rows(one)],
         "comparisons": comparisons,
     }
-    return write_study(
+    files = write_study(
         out,
         tables,
         _page(campaigns, rows, comparisons),
         [plan.configuration() for plan in plans],
         lambda folder: draw_figures(folder, campaigns, rows),
     )
+    return Report(files, "\n".join(line for one in campaigns for line in _in_short(one, rows)))
+
+
+def _in_short(campaign: CampaignResult, rows: Sequence[Row]) -> Iterator[str]:
+    few = {name: _POLICY_COLUMNS[name] for name in _FEW_COLUMNS}
+    yield from (f"{campaign.name}: {_protocol(campaign)}", "")
+    yield from plain_table(policy_rows(campaign, labelled(campaign, rows)), few)
+    yield ""
 
 
 def _with_results(plan: Plan) -> CampaignResult:
@@ -244,7 +270,7 @@ def _page(
             yield from table(pivot(plain, "label", "lanes", column), beside=beside)
         yield from _sizes(campaign, own, beside)
         if not campaign.with_truth:
-            yield from ("The drives have no truth: no pose errors, no false successes.", "")
+            yield from (_NO_TRUTH, "")
     if pooled := chosen(comparisons, campaign="pooled"):
         beside = "\n".join(dict.fromkeys(in_words(one.in_force()) for one in campaigns))
         yield from ("## All sessions pooled", "", *table(pooled, COMPARED, beside))

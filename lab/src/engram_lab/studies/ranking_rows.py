@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from engram.measures import Estimator
-from engram_lab.intervals import Resamples, beats, difference
+from engram_lab.intervals import Interval, Resamples, difference
 from engram_lab.studies.configurations import (
     UNLIMITED,
     Configuration,
@@ -151,7 +151,6 @@ def labelled(campaign: CampaignResult, rows: Sequence[Row]) -> list[Row]:
 
 def policy_rows(campaign: CampaignResult, own: Sequence[Row]) -> list[Row]:
     """All policies at the few lanes, losers too."""
-    nearest = campaign.get("distance")
     timed = {one.policy: result.step_ms for one, result in campaign.live.items()}
     rows = []
     for result in few_lanes_results(campaign):
@@ -160,11 +159,20 @@ def policy_rows(campaign: CampaignResult, own: Sequence[Row]) -> list[Row]:
             own, label=one.label, lanes=one.lanes_text, rounds=one.rounds, T=campaign.T,
             map_sessions=None,
         )  # fmt: skip
-        beaten = nearest is not None and result is not nearest
-        won = "yes" if beaten and nearest and beats(result.drives, nearest.drives) else "no"
         ms = timed.get(one.policy) if one.label == one.policy else None
-        rows.append({**row, "ms_as_on_a_robot": ms, "beats_distance": won if beaten else ""})
+        rows.append({**row, "ms_as_on_a_robot": ms, "beats_distance": _verdict(row)})
     return rows
+
+
+_VERDICTS = {True: "yes", False: "no", None: "no difference shown"}
+
+
+def _verdict(row: Row) -> str:
+    """Whether a policy misses less of the route than `distance` (method §8)."""
+    if row["label"] == "distance" or "minus_distance" not in row:
+        return ""
+    gap = Interval(*(row[f"minus_distance{end}"] for end in ("", "_low", "_high")))
+    return _VERDICTS[gap.lower]
 
 
 def rows_by_size(campaign: CampaignResult, own: Sequence[Row]) -> list[Row]:
