@@ -62,14 +62,14 @@ goldens: setup
 	$(BIN)/python -m tests.goldens check --all
 
 check: setup
-	$(BIN)/ruff format --check src lab tests ros
-	$(BIN)/ruff check src lab tests ros
+	$(BIN)/ruff format --check src lab tests ros examples
+	$(BIN)/ruff check src lab tests ros examples
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 format: setup
-	$(BIN)/ruff format src lab tests ros
-	$(BIN)/ruff check --fix src lab tests ros
+	$(BIN)/ruff format src lab tests ros examples
+	$(BIN)/ruff check --fix src lab tests ros examples
 
 docs: setup
 	$(BIN)/python -m pip install --quiet -c constraints.txt --group docs

@@ -25,6 +25,7 @@ import yaml
 import engram
 from engram import errors
 from engram.cli.app import app, main
+from engram.sequences import SEQUENCES
 from engram_lab.bench.data import synthetic_drive
 
 ROOT = Path(__file__).parent.parent
@@ -327,6 +328,11 @@ def test_every_link_to_a_file_leads_somewhere() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_page_of_layouts_has_a_row_for_each() -> None:
+    rows = re.findall(r"^\| `(\w[\w-]*)` \|", (DOCS / "data.md").read_text(), re.M)
+    assert sorted(rows) == sorted(SEQUENCES)
 
 
 def test_every_page_is_in_the_table_of_contents() -> None:

@@ -13,7 +13,14 @@ from typing import Any
 from engram.errors import ConfigError
 from engram.plugins import PluginGroup
 from engram.ranking.background import Background
-from engram.ranking.context import Foreseen, RankingContext, RankingPolicy, looks_ahead, uses_words
+from engram.ranking.context import (
+    Foreseen,
+    RankingContext,
+    RankingPolicy,
+    looks_ahead,
+    order_by,
+    uses_words,
+)
 from engram.ranking.distance import DistancePolicy
 from engram.ranking.lessons import Lessons
 from engram.ranking.path import PathPolicy
@@ -104,6 +111,7 @@ __all__ = [
     "RunAttempts",
     "RunLog",
     "check_for_robot",
+    "order_by",
     "policy_named",
     "policy_names",
     "reasons_of",
