@@ -46,7 +46,7 @@ def dream(
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
-    """Look for a better fleet map.
+    """Optimise a fleet map by held-out drives.
 
     Merges the robots' maps again, in other orders and with other settings, and compares the results
     on held-out drives. If the drives then localise significantly better, what the best result has
