@@ -19,6 +19,8 @@ from engram.cli import moved, wording
 from engram.cli.app import app
 from engram.cli.options import Drive
 from engram.cli.settings import AllSettings, every_setting
+from engram.cli.verbs import VERBS
+from engram.errors import InputError
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "engram"
@@ -193,17 +195,47 @@ def test_every_setting_that_a_text_names_exists() -> None:
 
 
 def test_what_the_laboratory_brings_is_named_as_its_own() -> None:
-    brought = {name for name in ("lab", "demo") if name in COMMANDS}
     wrong = [
         f"{place}:{line}: {text}"
         for place, line, text in TEXTS
         for found in _VERB.finditer(text)
-        if found[1] in {"lab", "demo"} and "engram-lab" not in text
-        # Both ask whether it is installed.
-        if place not in {"cli/moved.py", "cli/app.py"}
+        if found[1] in moved.LABORATORY and "engram-lab" not in text
+        if place != "cli/moved.py"  # it asks whether the laboratory is installed
     ]
     assert wrong == []
-    assert ("engram demo" in app.info.epilog) == ("demo" in brought)
+
+
+def test_the_laboratorys_verbs_are_those_of_its_distribution() -> None:
+    project = tomllib.loads((ROOT / "lab/pyproject.toml").read_text())["project"]
+    assert set(moved.LABORATORY) == project["entry-points"]["engram.verbs"].keys()
+
+
+@pytest.mark.parametrize("line", ["demo", "lab simulate hamlet", "simulate hamlet", "evaluate"])
+def test_a_verb_of_the_laboratory_says_where_it_comes_from(line: str) -> None:
+    without = typer.main.get_command(app)
+    for name in moved.LABORATORY:
+        without.commands.pop(name, None)
+    with pytest.raises(InputError, match=r"engram-lab, which is not installed.*pip install"):
+        without.main(line.split(), standalone_mode=False)
+
+
+def test_the_program_ends_with_commands_that_every_install_has(engram) -> None:
+    ending = engram().err.strip().splitlines()[-1] or engram().out.strip().splitlines()[-1]
+    named = [words for _, words, _ in named_commands(ending)]
+    assert named == ["try", "map"]
+    assert set(named) <= VERBS.keys()
+
+
+def test_no_text_proposes_a_verb_whose_extra_may_be_missing() -> None:
+    # Their texts depend on what is installed; `frame.py` only names what the picture shows.
+    aware = {"cli/wording.py", "cli/trying.py", "cli/frame.py"}
+    wrong = [
+        f"{place}:{line}: {text}"
+        for place, line, text in TEXTS
+        for found in _VERB.finditer(text)
+        if found[1] in {"plot", "view"} and place not in aware and _EXTRA.search(text) is None
+    ]
+    assert wrong == []
 
 
 @pytest.mark.parametrize("drawn", [True, False])

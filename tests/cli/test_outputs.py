@@ -30,6 +30,7 @@ FOLDERS = {
     ("localise", "--recorder"),
     ("doctor", "--pictures"),
     ("check", "--pictures"),
+    ("try", "--out"),
     ("centre", "backup", "TARGET"),
 }
 # What is read, or is made by a verb that does nothing before it.
@@ -123,7 +124,8 @@ def test_a_picture_of_an_unknown_kind_is_refused_before_the_work(engram, tmp_pat
     assert ".xyz is not one of" in told(answer)
 
 
-@pytest.mark.parametrize("words", sorted(written()), ids=" ".join)
+# `try` reads nothing that could be missing: it would go on and write.
+@pytest.mark.parametrize("words", sorted(written() - {("try", "--out")}), ids=" ".join)
 def test_a_place_that_takes_the_output_is_not_touched(engram, tmp_path, words):
     name = FILES.get(words, "folder")
     answer = engram(*typed(words, tmp_path / name))

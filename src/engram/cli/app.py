@@ -20,6 +20,7 @@ app = typer.Typer(
     name="engram",
     cls=Program,
     help="Lifelong visual localisation for fleets of robots with stereo cameras.",
+    epilog="Start with: engram try, or engram map street.engram DRIVE",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -46,9 +47,6 @@ def _program(
 
 
 register(app)
-# The demonstration comes with the laboratory.
-_DEMO = ", or engram demo" if any(one.name == "demo" for one in app.registered_commands) else ""
-app.info.epilog = f"Start with: engram map street.engram DRIVE{_DEMO}"
 
 # What Typer raises for any mistyped command line; of its kinds it exports only this one's child.
 _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])

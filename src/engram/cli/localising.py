@@ -24,9 +24,10 @@ _PICTURES = 20
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """Where the results go.
+    """Where the results go, and the map as the next command names it.
 
     Attributes:
+        map_path: the map, as it was typed.
         trajectory: file in TUM format; None for none.
         pictures: folder of match pictures; None for none.
         rate_hz: replay in real time; None for as fast as it goes.
@@ -37,6 +38,7 @@ class Outputs:
         view: "window" or a recording to watch it in Rerun; None for neither.
     """
 
+    map_path: Path
     trajectory: Path | None
     pictures: Path | None
     rate_hz: float | None
@@ -109,7 +111,7 @@ def localise_and_print(
     else:
         for warning in warnings(summary):
             typer.echo(warning, err=True)
-        typer.echo(localised_text(summary, frames, opened.location))
+        typer.echo(localised_text(summary, frames, outputs.map_path))
         if outputs.remember:
             typer.echo(robot.saving.text())
     if interrupted:

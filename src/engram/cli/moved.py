@@ -1,4 +1,4 @@
-"""Names that moved: for one release the old ones answer with the new."""
+"""Names that moved, which for one release answer with the new, and those of another package."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ VERBS = {
     "bench": "engram lab bench",
     "relocalise": "engram lab relocalise",
     "places": "engram lab places",
-    "try": "engram lab try",
 }
 
 _RANKING = {"--policy": "--ranking"}
@@ -59,6 +58,9 @@ GONE = {
     },
     **dict.fromkeys(("merge", "build", "tag", "revert", "vocabulary"), _AUTHOR),
 }
+# What the laboratory brings, a distribution of its own.
+LABORATORY = ("demo", "lab")
+_INSTALL = "engram-lab, which is not installed; from a checkout of Engram: pip install ./lab"
 # Other spellings of a verb, which stay.
 SPELLINGS = {"localize": "localise"}
 
@@ -69,8 +71,15 @@ def moved_verb(name: str, known: Collection[str]) -> str | None:
         return None
     answer = f"`engram {name}` is now `{VERBS[name]}`"
     if VERBS[name].startswith("engram lab") and "lab" not in known:
-        answer += "; it comes with engram-lab, which is not installed"
+        answer += f"; it comes with {_INSTALL}"
     return answer
+
+
+def brought_verb(name: str, known: Collection[str]) -> str | None:
+    """Where to get a verb of the laboratory that is not installed; None for other names."""
+    if name in known or name not in LABORATORY:
+        return None
+    return f"`engram {name}` comes with {_INSTALL}"
 
 
 def moved_option(verb: str | None, option: str) -> str | None:

@@ -27,12 +27,14 @@ from engram.cli.live import live
 from engram.cli.maps import amend, check, info, plot, vocabulary
 from engram.cli.options import spread
 from engram.cli.showing import settings
+from engram.cli.trying import try_
 from engram.cli.view import view
 from engram.errors import ConfigError, IncompatibleError, InputError
 from engram.plugins import PluginGroup
 
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
     "Drives": {
+        "try": try_,
         "doctor": doctor,
         "map": map_,
         "localise": localise,
@@ -94,9 +96,10 @@ class Program(TyperGroup):
         """The verb that the arguments begin with.
 
         Raises:
-            InputError: it has another name now.
+            InputError: it has another name now, or comes with a package that is not installed.
         """
-        if answer := moved.moved_verb(args[0], self.commands):
+        answer = moved.moved_verb(args[0], self.commands)
+        if answer := answer or moved.brought_verb(args[0], self.commands):
             raise InputError(answer)
         return super().resolve_command(ctx, args)
 
