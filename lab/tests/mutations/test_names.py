@@ -90,7 +90,7 @@ DRIVE_VERBS = [
 ]
 # They show nothing of a map or a drive: their own files, or long work of the laboratory.
 OWN = {
-    "settings", "features", "demo", "lab bench", "lab fleet-day", "lab simulate",
+    "settings", "features", "try", "demo", "lab bench", "lab fleet-day", "lab simulate",
     "lab evaluate faults", "lab evaluate fleet", "lab evaluate ranking",
 }  # fmt: skip
 

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from engram.cli import outputs
-from engram.cli.endings import VerbInterruptedError
+from engram.cli.endings import ExitStatus, VerbInterruptedError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+_INTERRUPTED = "interrupted; what was done is kept, and the same command resumes"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +75,7 @@ def try_(
         if not drives_only:
             _tour(ctx, out)
     except (KeyboardInterrupt, VerbInterruptedError):
-        raise VerbInterruptedError(
-            "interrupted; what was done is kept, and the same command resumes"
-        ) from None
+        raise VerbInterruptedError(_INTERRUPTED) from None
 
 
 def _write_drives(out: Path) -> None:
@@ -116,6 +116,7 @@ def _tour(ctx: typer.Context, out: Path) -> None:
 
     Raises:
         Exit: a step failed.
+        VerbInterruptedError: it was interrupted.
     """
     for step in steps(out):
         typer.echo(f"\n{step.about}\n$ {step.typed}")
@@ -128,8 +129,15 @@ def _tour(ctx: typer.Context, out: Path) -> None:
 
 
 def _run(ctx: typer.Context, step: Step) -> int:
-    """Runs a command in this process; its exit status."""
-    return int(ctx.find_root().command.main(list(step.words), standalone_mode=False) or 0)
+    """Runs a command in this process; its exit status.
+
+    Raises:
+        VerbInterruptedError: it was interrupted.
+    """
+    status = int(ctx.find_root().command.main(list(step.words), standalone_mode=False) or 0)
+    if status == ExitStatus.INTERRUPTED:
+        raise VerbInterruptedError("interrupted")
+    return status
 
 
 def _end(out: Path) -> None:
