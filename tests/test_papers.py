@@ -310,12 +310,12 @@ def test_the_first_success_ends_the_frame_where_the_papers_settings_say_so(stree
 def test_a_drive_attempts_as_its_paper_says(street, paper):
     """In light that no node has, nothing ends a frame but its budget."""
     published, ours = (Effort().over(read_settings(one)) for one in (Path(paper), None))
-    assert published == {"policy": "path", "lanes": 2, "rounds": 1, "threads": None}
-    assert ours == {"policy": "recall", "lanes": 2, "rounds": 2, "threads": None}
+    assert published == {"ranking": "path", "lanes": 2, "rounds": 1, "threads": None}
+    assert ours == {"ranking": "recall", "lanes": 2, "rounds": 2, "threads": None}
     live = drive(WORLD, ROAD[-3:], 7, start_ns=10**15, seed=3)
     for asked in (published, ours):
         with Map.open(street) as opened, localiser_in(
-            opened, live[0].frame.camera, Settings(), policy=asked["policy"],
+            opened, live[0].frame.camera, Settings(), policy=asked["ranking"],
             budget=Budget(asked["lanes"], asked["rounds"]), relocaliser=None,
         ) as localiser:  # fmt: skip
             localiser.place_at(Position.at(opened.graph.node(20).id))

@@ -16,7 +16,7 @@ from engram.cli.app import app
 from engram.errors import IncompatibleError
 from engram.frontend.features import feature_kind
 from engram.ranking import policy_named, policy_names
-from engram.sequences import layout_named, layout_names, open_sequence
+from engram.sequences import layout_named, layout_names, open_drive
 
 
 class NoRank:
@@ -129,7 +129,7 @@ def test_names_of_engram_are_its_own(added) -> None:
 def test_a_broken_reader_is_named_when_a_drive_is_recognised(added, tmp_path: Path) -> None:
     added("engram.readers", "no_such_module:thing")
     with pytest.raises(IncompatibleError, match="reader of drives 'one' of package-0"):
-        open_sequence(tmp_path)
+        open_drive(tmp_path)
 
 
 def test_a_broken_verb_says_so_and_leaves_the_others_alone(added) -> None:

@@ -12,7 +12,7 @@ from tests.sequences.synthetic import only_engram_errors, write_log
 
 from engram.errors import SequenceError
 from engram.geometry import SE3
-from engram.sequences import open_sequence
+from engram.sequences import open_drive
 from engram.sequences.trajectories import Trajectory, write_tum
 from engram_lab.truth import (
     read_euroc_truth,
@@ -66,7 +66,7 @@ def test_the_truth_of_a_log_stands_beside_it(tmp_path: Path) -> None:
 
 @pytest.mark.data
 def test_kitti_poses_belong_to_the_frames(data_dir: Path) -> None:
-    drive = open_sequence(data_dir / "kitti_odometry/sequences/06")
+    drive = open_drive(data_dir / "kitti_odometry/sequences/06")
     truth = read_kitti_poses(data_dir / "kitti_odometry/poses/06.txt", drive.stamps_ns)
     np.testing.assert_allclose(truth.world_from_cam[0].matrix(), np.eye(4), atol=1e-6)
     steps = [
@@ -80,7 +80,7 @@ def test_kitti_poses_belong_to_the_frames(data_dir: Path) -> None:
 def test_euroc_truth_has_a_pose_for_every_pair(data_dir: Path) -> None:
     folder = data_dir / "euroc/V1_01_easy_sparse"
     truth = read_matrix_truth(folder / "poses_world_from_rectified_cam0.txt")
-    stamps_ns = open_sequence(folder).stamps_ns
+    stamps_ns = open_drive(folder).stamps_ns
     assert truth.stamps_ns.tolist() == stamps_ns.tolist()
 
 

@@ -18,7 +18,7 @@ KEYS = {
 @pytest.fixture(scope="module")
 def centre(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("fleet") / "centre.engram"
-    sequence = open_drive(street, start="2026-03-01T09:30:00", longitude_deg=0.0)
+    sequence = open_drive(street, recorded_at="2026-03-01T09:30:00", longitude_deg=0.0)
     map_drive(path, sequence, Settings(), RobotOptions())
     return path
 

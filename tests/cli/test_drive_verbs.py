@@ -16,13 +16,13 @@ from engram.calibration import read_calibration
 from engram.errors import NotAMapError
 from engram.geometry import StereoCamera
 from engram.maps import open_map
-from engram.sequences import open_sequence
+from engram.sequences import open_drive
 
 
 @pytest.fixture(scope="module")
 def street_bag(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The rendered street as a bag."""
-    drive = open_sequence(street)
+    drive = open_drive(street)
     pairs = [(pair.stamp_ns + 10**18, pair.left, pair.right) for pair in drive]
     folder = tmp_path_factory.mktemp("bags")
     return StereoBag(pairs, rectified_infos(drive.camera)).write(folder / "street", "mcap")
@@ -70,12 +70,12 @@ def test_a_calibration_can_be_edited_and_given_back(engram, street_bag, tmp_path
     assert "baseline" in ran.out
     file = tmp_path / "calibration.toml"
     file.write_text(ran.out)
-    drive = open_sequence(street_bag)
+    drive = open_drive(street_bag)
     assert read_calibration(file).camera == drive.camera
     picture = cv2.imread(str(tmp_path / "pair.png"))
     assert picture.shape[1] == 2 * drive.camera.width + 4
     file.write_text(ran.out.replace("baseline_m = ", "baseline_m = 1"))
-    again = open_sequence(street_bag, calibration=file)
+    again = open_drive(street_bag, calibration=file)
     assert again.camera.baseline_m > 1
 
 
@@ -243,7 +243,7 @@ def test_a_drive_of_another_place_is_told(engram, street, tmp_path: Path) -> Non
 
 
 def test_a_note_on_the_calibration_is_told_once(engram, street: Path, tmp_path: Path) -> None:
-    drive = open_sequence(street)
+    drive = open_drive(street)
     left, right = rectified_infos(drive.camera)
     p = np.array(right["p"])
     p[0, 3] *= -1

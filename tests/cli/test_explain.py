@@ -24,7 +24,7 @@ def test_every_policy_is_explained(engram, street: Path, town: Path, policy: str
     assert ran.status == 0
     assert "NaN" not in ran.out, "which is no JSON"
     found = ran.json
-    assert (found["frame"], found["policy"], found["status"]) == (6, policy, "localised")
+    assert (found["frame"], found["ranking"], found["status"]) == (6, policy, "localised")
     candidates = found["candidates"]
     assert len(candidates) > 3
     # The frame stands beside the node that was saved from it or from its neighbour.

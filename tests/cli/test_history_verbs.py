@@ -21,7 +21,9 @@ def two_drives(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two revisions: the street, driven by two robots."""
     path = tmp_path_factory.mktemp("maps") / "town.engram"
     for robot in ("r1", "r2"):
-        sequence = open_drive(street, robot=robot, start="2026-03-01T09:30:00", longitude_deg=0.0)
+        sequence = open_drive(
+            street, robot=robot, recorded_at="2026-03-01T09:30:00", longitude_deg=0.0
+        )
         map_drive(path, sequence, Settings(), RobotOptions())
     return path
 

@@ -68,15 +68,15 @@ def test_the_settings_rank_and_attempt_unless_options_do(
     for config in ("linegar2015", "gadd2016"):
         ran = engram(*words, "--config", config)
         assert "far enough" in ran.err
-        assert (seen[-1].policy, seen[-1].lanes, seen[-1].rounds) == ("path", 2, 1)
+        assert (seen[-1].ranking, seen[-1].lanes, seen[-1].rounds) == ("path", 2, 1)
     engram(*words)
-    assert (seen[-1].policy, seen[-1].lanes, seen[-1].rounds) == ("recall", 2, 2)
+    assert (seen[-1].ranking, seen[-1].lanes, seen[-1].rounds) == ("recall", 2, 2)
     assert seen[-1].threads is None
     engram(*words, "--set", "drive.threads=7")
     assert seen[-1].threads == 7
     if verb in {"map", "localise", "live", "lab try"}:
         engram(*words, "--config", "linegar2015", "--ranking", "distance", "--lanes", 1)
-        assert (seen[-1].policy, seen[-1].lanes, seen[-1].rounds) == ("distance", 1, 1)
+        assert (seen[-1].ranking, seen[-1].lanes, seen[-1].rounds) == ("distance", 1, 1)
 
 
 class _Nothing:

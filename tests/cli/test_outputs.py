@@ -16,7 +16,7 @@ FILES = {
     ("live", "--view"): "v.rrd",
     ("record", "LOG"): "d.framelog",
     ("plot", "FILE"): "p.png",
-    ("view", "--save"): "v.rrd",
+    ("view", "--view"): "v.rrd",
     ("export", "FILE"): "e.csv",
     ("diff", "--picture"): "p.png",
     ("merge", "FLEET"): "f.engram",

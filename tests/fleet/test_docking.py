@@ -466,7 +466,7 @@ class TestGate:
 
 def test_a_merge_that_serves_held_out_drives_passes_the_gate(tmp_path, centre, fleet, monkeypatch):
     held_out = frame_log(tmp_path / "held-out.framelog", np.arange(12, 36, 0.8), 0, day=8)
-    asked, driven = RobotOptions(policy="distance", lanes=4), []
+    asked, driven = RobotOptions(ranking="distance", lanes=4), []
 
     def spied(store, drive, settings, options, monitor):
         driven.append(options)

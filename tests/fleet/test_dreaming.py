@@ -52,7 +52,7 @@ class Twilight(World):
 TOWN = Twilight(20.0, seed=5)
 ASKED = DreamOptions(
     merging=OPTIONS,
-    localising=RobotOptions(relocaliser="exhaustive", policy="distance"),
+    localising=RobotOptions(relocaliser="exhaustive", ranking="distance"),
     judge_at_m=3.0,
 )
 

@@ -53,7 +53,7 @@ from engram.places import (
 from engram.places.vocabulary import default_vocabulary
 from engram.robot import Settings
 from engram.robot.recording import extract_log
-from engram.sequences import FrameLog, open_sequence
+from engram.sequences import FrameLog, open_drive
 from engram.testing import check_kind, unmet
 
 CAMERA = StereoCamera(260.0, 260.0, 160.0, 120.0, 0.2, 320, 240)
@@ -166,11 +166,11 @@ def test_a_drive_is_mapped_and_another_is_localised_in_it(
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_frame_log_keeps_what_was_extracted(kind: DescriptorKind, tmp_path: Path) -> None:
-    sequence = open_sequence(write_drive(tmp_path / "a", 1))
+    sequence = open_drive(write_drive(tmp_path / "a", 1))
     out = tmp_path / "a.framelog"
     settings = Settings().for_descriptor(kind)
     extract_log(sequence, out, settings)
-    log = open_sequence(out)
+    log = open_drive(out)
     assert isinstance(log, FrameLog)
     for live, logged in zip(sequence, log, strict=True):
         expected = Frontend(settings.frontend).extract(live)

@@ -123,7 +123,7 @@ def map_one(path: Path, sequence: DriveSequence, *, threads: bool, **how: Any) -
 
 def localise(path: Path, sequence: DriveSequence, *, policy: str, threads: bool) -> list[Values]:
     """Localises a drive by the budget of the command line; what was found of each frame."""
-    options = RobotOptions(policy=policy, threads=_most(threads))
+    options = RobotOptions(ranking=policy, threads=_most(threads))
     with open_map(path) as opened:
         found = localise_drive(opened, sequence, Settings(), options)
     return [_found(one, one.motion.odometry.prev_from_curr) for one in found]

@@ -46,7 +46,7 @@ def map_recorded(path: Path, seen: list[Seen]) -> None:
 def map_live(path: Path, seen: list[Seen]) -> None:
     with (
         open_map(path) as opened,
-        opened.robot(seen[0].frame.camera, name="r2", maps=True, policy="path", rounds=4) as robot,
+        opened.robot(seen[0].frame.camera, name="r2", maps=True, ranking="path", rounds=4) as robot,
     ):
         for one in seen:
             robot.step(one.logged)

@@ -8,14 +8,14 @@ import pytest
 from engram.frontend import Frame, Frontend, MatcherConfig, match_frames
 from engram.geometry import SE3
 from engram.odometry import Odometry
-from engram.sequences import open_sequence
+from engram.sequences import open_drive
 
 pytestmark = pytest.mark.data
 
 
 def frames_of(folder: Path, **options) -> list[Frame]:
     frontend = Frontend()
-    return [frontend.extract(pair) for pair in open_sequence(folder, **options)]
+    return [frontend.extract(pair) for pair in open_drive(folder, **options)]
 
 
 def test_drift_on_a_road_stays_below_one_per_cent(data_dir: Path) -> None:

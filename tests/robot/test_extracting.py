@@ -10,7 +10,7 @@ from engram.errors import IncompatibleError, SequenceError
 from engram.monitor import Advancing
 from engram.robot.recording import extract_log
 from engram.robot.settings import Settings
-from engram.sequences import FrameLog, open_sequence
+from engram.sequences import FrameLog, open_drive
 
 PAIRS = 6
 
@@ -38,7 +38,7 @@ def drive(tmp_path: Path) -> Path:
 
 def test_an_interrupted_recording_equals_one_in_one_go(drive: Path, tmp_path: Path) -> None:
     whole, parts = tmp_path / "whole.framelog", tmp_path / "parts.framelog"
-    extract_log(open_sequence(drive), whole, Settings())
+    extract_log(open_drive(drive), whole, Settings())
     calls = 0
 
     def interrupt(word: str) -> None:
@@ -47,10 +47,10 @@ def test_an_interrupted_recording_equals_one_in_one_go(drive: Path, tmp_path: Pa
         if calls == 3:
             raise KeyboardInterrupt
 
-    first = extract_log(open_sequence(drive), parts, Settings(), Advancing(interrupt))
+    first = extract_log(open_drive(drive), parts, Settings(), Advancing(interrupt))
     assert first.interrupted
     assert not FrameLog(parts).complete
-    second = extract_log(open_sequence(drive), parts, Settings())
+    second = extract_log(open_drive(drive), parts, Settings())
     assert (second.already_recorded, second.frames) == (3, PAIRS - 3)
     logs = [FrameLog(path) for path in (whole, parts)]
     assert all(log.complete for log in logs)
@@ -66,35 +66,35 @@ def test_a_drive_that_breaks_off_is_not_called_complete(drive: Path, tmp_path: P
     (drive / "left" / "4.png").write_bytes(b"")
     log = tmp_path / "a.framelog"
     with pytest.raises(SequenceError, match=r"4\.png"):
-        extract_log(open_sequence(drive), log, Settings())
+        extract_log(open_drive(drive), log, Settings())
     assert not FrameLog(log).complete
     assert len(FrameLog(log)) == 4
 
 
 def test_other_frames_do_not_go_into_the_same_log(drive: Path, tmp_path: Path) -> None:
     log = tmp_path / "a.framelog"
-    extract_log(open_sequence(drive), log, Settings())
+    extract_log(open_drive(drive), log, Settings())
     with pytest.raises(IncompatibleError, match="choice of frames"):
-        extract_log(open_sequence(drive, frames="::2"), log, Settings())
+        extract_log(open_drive(drive, frames="::2"), log, Settings())
 
 
 def test_other_images_do_not_go_into_the_same_log(drive: Path, tmp_path: Path) -> None:
     log = tmp_path / "a.framelog"
-    extract_log(open_sequence(drive), log, Settings())
+    extract_log(open_drive(drive), log, Settings())
     (drive / "left" / "0.png").write_bytes((drive / "left" / "1.png").read_bytes())
     with pytest.raises(IncompatibleError, match="other images"):
-        extract_log(open_sequence(drive), log, Settings())
+        extract_log(open_drive(drive), log, Settings())
 
 
 def test_a_drive_without_a_readable_pair_is_told(drive: Path, tmp_path: Path) -> None:
     for image in (drive / "right").iterdir():
         image.write_bytes(b"no image")
     with pytest.raises(SequenceError, match="no frame can be read"):
-        extract_log(open_sequence(drive, skip_bad=True), tmp_path / "a.framelog", Settings())
+        extract_log(open_drive(drive, skip_bad=True), tmp_path / "a.framelog", Settings())
 
 
 def test_a_log_is_not_extracted_again(drive: Path, tmp_path: Path) -> None:
     log = tmp_path / "a.framelog"
-    extract_log(open_sequence(drive), log, Settings())
+    extract_log(open_drive(drive), log, Settings())
     with pytest.raises(SequenceError, match="already a frame log"):
-        extract_log(open_sequence(log), tmp_path / "b.framelog", Settings())
+        extract_log(open_drive(log), tmp_path / "b.framelog", Settings())

@@ -57,7 +57,7 @@ def anchored(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of the street along a circle of latitude."""
     folder = tmp_path_factory.mktemp("anchored")
     path = folder / "street.engram"
-    map_drive(path, open_drive(street, frames="::2", start=START_NS))
+    map_drive(path, open_drive(street, frames="::2", recorded_at=START_NS))
     with open_map(path) as opened:
         lines = [
             f"{node.id},50.0,{14 + opened.frame.pose(node.id).translation[0] / METRES_PER_DEGREE}"
@@ -87,7 +87,7 @@ class Script:
 def test_a_live_robot_is_found_by_its_fix(anchored: Path, street: Path, east_m: float) -> None:
     frames = [
         FrameEvent(pair, time.perf_counter())
-        for pair in open_drive(street, frames="5::2", start=START_NS)
+        for pair in open_drive(street, frames="5::2", recorded_at=START_NS)
     ]
     with open_map(anchored) as opened:
         at_m = opened.frame.positions[len(opened.graph) // 2 :, 0].min() + east_m
@@ -118,7 +118,7 @@ def test_the_fixes_of_a_wrong_clock_keep_their_order_and_their_times(tmp_path: P
 def test_a_robot_without_recognition_is_found_by_its_fixes(
     sigmas: float, anchored: Path, street: Path, tmp_path: Path
 ) -> None:
-    live = open_drive(street, frames="5::2", start=START_NS)
+    live = open_drive(street, frames="5::2", recorded_at=START_NS)
     pairs = [(pair.stamp_ns, pair.left, pair.right) for pair in live]
     with open_map(anchored) as opened:
         middle = opened.frame.positions[len(opened.graph) // 2 :, 0].min()

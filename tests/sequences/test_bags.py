@@ -19,7 +19,7 @@ from engram.errors import (
     SequenceError,
 )
 from engram.graph.model import Clock
-from engram.sequences import BagSequence, open_sequence
+from engram.sequences import BagSequence, open_drive
 from engram.sequences.bags import Bag, messages
 from engram.sequences.bags.inspecting import describe_bag
 from engram.sequences.bags.pairing import learnt_tolerance
@@ -47,7 +47,7 @@ def kind(request: pytest.FixtureRequest) -> str:
 
 
 def opened(path: Path, **options) -> BagSequence:
-    sequence = open_sequence(path, **options)
+    sequence = open_drive(path, **options)
     assert isinstance(sequence, BagSequence)
     return sequence
 
@@ -118,7 +118,7 @@ class TestContainers:
         for name in ("monday", "tuesday"):
             WHOLE.write(tmp_path / name, "ros1")
         with pytest.raises(SequenceError, match=r"(?s)holds some.*monday\.bag.*tuesday\.bag"):
-            open_sequence(tmp_path)
+            open_drive(tmp_path)
 
     def test_messages_are_those_of_rosbags(self, tmp_path, kind) -> None:
         from rosbags.highlevel import AnyReader
@@ -152,7 +152,7 @@ def test_a_bag_cut_before_the_right_images_says_so(tmp_path) -> None:
     cut = content.index(PICTURES[0][2].tobytes())
     path.write_bytes(content[:cut])
     with pytest.raises(SequenceError, match=r"no image can be read; .*cut short"):
-        open_sequence(path)
+        open_drive(path)
 
 
 def colours() -> np.ndarray:
@@ -301,7 +301,7 @@ class TestTopics:
         names = [f"/{rig}/{side}/image_raw" for rig in rigs for side in ("left", "right")]
         path = named(tmp_path, *names)
         with pytest.raises(SequenceError, match="2 stereo pairs; choose one with") as caught:
-            open_sequence(path)
+            open_drive(path)
         for rig in rigs:
             line = f"--left /{rig}/left/image_raw --right /{rig}/right/image_raw"
             assert line in str(caught.value)
@@ -314,32 +314,32 @@ class TestTopics:
     def test_no_pair_lists_what_there_is(self, tmp_path) -> None:
         path = named(tmp_path, "/front/image", "/rear/image", "/roof/image")
         with pytest.raises(SequenceError, match=r"(?s)--left TOPIC.*/front/image.*/rear/image"):
-            open_sequence(path)
+            open_drive(path)
         assert describe_bag(path).command.endswith("--left TOPIC --right TOPIC")
 
     def test_two_topics_are_offered_as_the_pair(self, tmp_path) -> None:
         path = named(tmp_path, "/eye_a/image", "/eye_b/image", "/camera/depth/image")
         offered = "--left /eye_a/image --right /eye_b/image"
         with pytest.raises(SequenceError, match=offered):
-            open_sequence(path)
+            open_drive(path)
         assert describe_bag(path).command.endswith(offered)
 
     def test_one_camera_is_not_enough(self, tmp_path) -> None:
         path = named(tmp_path, "/camera/color/image_raw", "/camera/depth/image")
         with pytest.raises(SequenceError, match="one camera only"):
-            open_sequence(path)
+            open_drive(path)
         assert describe_bag(path).command == "", "no option helps"
 
     def test_a_topic_that_is_not_there_or_no_image(self, tmp_path) -> None:
         path = WHOLE.write(tmp_path / "b", "mcap")
         with pytest.raises(SequenceError, match="--left /nowhere: the bag has no such topic"):
-            open_sequence(path, left="/nowhere")
+            open_drive(path, left="/nowhere")
         with pytest.raises(SequenceError, match="holds sensor_msgs/msg/CameraInfo, not images"):
-            open_sequence(path, right="/stereo/right/camera_info")
+            open_drive(path, right="/stereo/right/camera_info")
 
     def test_topics_are_for_bags(self, tmp_path, street) -> None:
         with pytest.raises(ConfigError, match="topics of a bag"):
-            open_sequence(street, left="/left/image")
+            open_drive(street, left="/left/image")
 
 
 class TestPairs:
@@ -356,7 +356,7 @@ class TestPairs:
     def test_images_of_two_instants_are_no_pair(self, tmp_path) -> None:
         late = StereoBag(PICTURES, rectified_infos(camera()), offset_ns=30_000_000)
         with pytest.raises(SequenceError, match=r"not synchronised: typically 30\.0 ms apart"):
-            open_sequence(late.write(tmp_path / "b", "mcap"))
+            open_drive(late.write(tmp_path / "b", "mcap"))
 
     def test_a_lost_image_loses_its_pair_only(self, tmp_path, kind) -> None:
         with bag(tmp_path / "gaps", kind) as maker:
@@ -416,15 +416,14 @@ class TestPairs:
 
     def test_frames_and_times(self, tmp_path) -> None:
         path = WHOLE.write(tmp_path / "b", "mcap")
-        from engram.sequences import TimeRange
 
         def numbers(**options) -> list[int]:
             return [(pair.stamp_ns - START_NS) // PERIOD_NS for pair in opened(path, **options)]
 
         assert numbers(frames="1::2") == [1, 3, 5]
-        assert numbers(times=TimeRange.parse("0.2", "0.4")) == [2, 3, 4]
-        assert numbers(times=TimeRange.parse("2014-05-13T16:53:20.3Z", None)) == [3, 4, 5]
-        assert numbers(times=TimeRange.parse("0.2", None), frames="1::2") == [3, 5]
+        assert numbers(from_=0.2, to="0.4") == [2, 3, 4]
+        assert numbers(from_="2014-05-13T16:53:20.3Z") == [3, 4, 5]
+        assert numbers(from_="0.2", frames="1::2") == [3, 5]
 
 
 class TestDamage:
@@ -469,7 +468,7 @@ class TestDamage:
         path = tmp_path / f"b{suffix}"
         path.write_bytes(content)
         with pytest.raises(SequenceError, match=str(path)):
-            open_sequence(path)
+            open_drive(path)
 
     def test_a_huge_image_is_not_decoded(self, tmp_path) -> None:
         header = cv2.imencode(".png", picture(0, 0))[1].tobytes()
@@ -487,7 +486,7 @@ class TestCalibration:
     def test_without_one_the_option_is_named(self, tmp_path) -> None:
         path = StereoBag(PICTURES, None).write(tmp_path / "b", "mcap")
         with pytest.raises(CalibrationError, match=r"no CameraInfo.*--calibration FILE"):
-            open_sequence(path)
+            open_drive(path)
 
     def test_the_only_two_are_taken_wherever_they_are(self, tmp_path) -> None:
         left, right = rectified_infos(camera())
@@ -503,23 +502,23 @@ class TestCalibration:
                 maker.image((LEFT, RIGHT)[side], START_NS, picture(0, side))
             maker.info("/calib/a", START_NS, rectified_infos(camera())[0])
         with pytest.raises(CalibrationError, match=r"those of /calib/a belong to other topics"):
-            open_sequence(tmp_path / "b")
+            open_drive(tmp_path / "b")
 
     def test_swapped_topics_are_told(self, tmp_path) -> None:
         path = WHOLE.write(tmp_path / "b", "mcap")
         with pytest.raises(CalibrationError, match="are left and right swapped"):
-            open_sequence(path, left=RIGHT, right=LEFT)
+            open_drive(path, left=RIGHT, right=LEFT)
 
     def test_one_of_other_images_is_refused(self, tmp_path) -> None:
         infos = tuple({**info, "width": 640, "height": 480} for info in WHOLE.infos)
         path = StereoBag(PICTURES, infos).write(tmp_path / "b", "mcap")
         with pytest.raises(CalibrationError, match=r"640×480 px, the images of .* are 48×32"):
-            open_sequence(path)
+            open_drive(path)
 
     def test_without_the_extra_the_command_is_named(self, tmp_path, monkeypatch) -> None:
         path = WHOLE.write(tmp_path / "b", "mcap")
         messages._store.cache_clear()
         monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
         with pytest.raises(MissingExtraError, match=r"pip install 'engram-localisation\[bags\]'"):
-            open_sequence(path)
+            open_drive(path)
         messages._store.cache_clear()

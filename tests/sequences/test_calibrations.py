@@ -18,7 +18,7 @@ from engram.errors import CalibrationError, ConfigError
 from engram.frontend import Frontend, StereoPair
 from engram.geometry import SE3
 from engram.geometry.rectification import DistortionModel, RawCamera, RawStereoCalibration
-from engram.sequences import BagSequence, open_sequence
+from engram.sequences import BagSequence, open_drive
 from engram.sequences.bags.inspecting import describe_bag
 from engram.sequences.options import OpenOptions
 from engram_lab.bench.data import synthetic_drive
@@ -278,13 +278,13 @@ class TestDrives:
         given = tmp_path / "given.toml"
         text = calibration_toml(Cameras(camera())).replace("baseline_m = 0.1", "baseline_m = 0.7")
         given.write_text(text)
-        assert open_sequence(path, calibration=given).camera.baseline_m == 0.7
+        assert open_drive(path, calibration=given).camera.baseline_m == 0.7
         LAYOUTS[name].calibration(path).unlink()
-        assert open_sequence(path, calibration=given).camera.baseline_m == 0.7
+        assert open_drive(path, calibration=given).camera.baseline_m == 0.7
 
     def test_a_view_is_for_raw_images(self, tmp_path) -> None:
         with pytest.raises(CalibrationError, match="rectified already"):
-            open_sequence(LAYOUTS["kitti"].write(tmp_path), field_of_view_deg=80.0)
+            open_drive(LAYOUTS["kitti"].write(tmp_path), field_of_view_deg=80.0)
 
     def test_a_kalibr_chain_names_the_topics_of_a_bag(self, tmp_path) -> None:
         topics = ("/cam0/image_raw", "/cam1/image_raw")
@@ -292,7 +292,7 @@ class TestDrives:
             for topic in (*topics, LEFT, RIGHT):  # two pairs: the chain decides
                 maker.image(topic, stamp_ns(0), np.full((240, 320), 90, np.uint8))
         (tmp_path / "chain.yaml").write_text(camchain())
-        drive = open_sequence(tmp_path / "b", calibration=tmp_path / "chain.yaml")
+        drive = open_drive(tmp_path / "b", calibration=tmp_path / "chain.yaml")
         assert isinstance(drive, BagSequence)
         assert (drive.topics.left, drive.topics.right) == topics
         assert_same(drive.cameras)
@@ -303,7 +303,7 @@ class TestBags:
 
     def test_raw_images_are_rectified_by_camera_info(self, tmp_path) -> None:
         path = StereoBag(list(self.PAIR), ros_infos()).write(tmp_path / "b", "ros1")
-        drive = open_sequence(path)
+        drive = open_drive(path)
         assert isinstance(drive, BagSequence)
         assert drive.cameras.rectification is not None
         assert_same(drive.cameras, atol=1e-4)
@@ -322,7 +322,7 @@ class TestBags:
                 maker.image(topic, stamp_ns(0), picture(0, side))
                 info = topic.replace("image_raw", "camera_info")
                 maker.info(info, stamp_ns(0), rectified_infos(camera())[side], "left")
-        found = open_sequence(tmp_path / "b").camera.cam_from_rig
+        found = open_drive(tmp_path / "b").camera.cam_from_rig
         assert found is not None
         np.testing.assert_allclose(found.matrix(), base_from_left.inverse().matrix(), atol=1e-9)
 
@@ -335,9 +335,9 @@ class TestBags:
                 name = topic.replace("image_raw", "camera_info")
                 maker.info(name, stamp_ns(0), ros_infos()[side], "left")
         (tmp_path / "chain.yaml").write_text(camchain())
-        found = open_sequence(tmp_path / "b", calibration=tmp_path / "chain.yaml")
+        found = open_drive(tmp_path / "b", calibration=tmp_path / "chain.yaml")
         assert isinstance(found, BagSequence)
-        alone = open_sequence(tmp_path / "b")
+        alone = open_drive(tmp_path / "b")
         assert isinstance(alone, BagSequence)
         assert found.camera.cam_from_rig is not None
         assert alone.camera.cam_from_rig is not None
@@ -359,7 +359,7 @@ class TestBags:
                 maker.image(topic, stamp_ns(0), self.PAIR[0][1])
                 name = topic.replace("image_raw", "camera_info")
                 maker.info(name, stamp_ns(0), infos[side], ("left", "right")[side])
-        drive = open_sequence(tmp_path / "b")
+        drive = open_drive(tmp_path / "b")
         assert isinstance(drive, BagSequence)
         assert_same(drive.cameras)
 
@@ -384,7 +384,7 @@ class TestMask:
         mask = np.full((camera().height, camera().width), 255, np.uint8)
         mask[20:] = 0
         cv2.imwrite(str(tmp_path / "mask.png"), mask)
-        pair = next(iter(open_sequence(path, mask=tmp_path / "mask.png")))
+        pair = next(iter(open_drive(path, mask=tmp_path / "mask.png")))
         np.testing.assert_array_equal(pair.mask, mask > 0)
 
     @pytest.mark.parametrize(
@@ -395,4 +395,4 @@ class TestMask:
         path = LAYOUTS["folder"].write(tmp_path)
         cv2.imwrite(str(tmp_path / "mask.png"), image)
         with pytest.raises(ConfigError, match=fact):
-            open_sequence(path, mask=tmp_path / "mask.png")
+            open_drive(path, mask=tmp_path / "mask.png")

@@ -16,7 +16,7 @@ import yaml
 
 from engram.errors import CalibrationError, SequenceError
 from engram.geometry import SE3
-from engram.sequences import BagSequence, open_sequence
+from engram.sequences import BagSequence, open_drive
 from engram.sequences.bags import database
 from engram.sequences.bags.bag import Bag
 from engram.sequences.bags.inspecting import describe_bag
@@ -82,7 +82,7 @@ class TestRealSense:
                 shift = sign * SIDES[side].translation
                 maker.pose(f"{base}/tf/0", START_NS, SE3(np.eye(3), shift))
             images(maker, (self.LEFT, self.RIGHT))
-        sequence = open_sequence(tmp_path / "viewer.bag")
+        sequence = open_drive(tmp_path / "viewer.bag")
         assert_whole(sequence)
         assert describe_bag(tmp_path / "viewer.bag").question == ""
 
@@ -90,7 +90,7 @@ class TestRealSense:
         changed = infos(model="inverse_brown_conrady", d=np.full(5, 0.1))
         path = StereoBag(PICTURES, changed).write(tmp_path / "b", "mcap")
         with pytest.raises(CalibrationError, match=r"'inverse_brown_conrady'; known: .*calibrate"):
-            open_sequence(path)
+            open_drive(path)
 
 
 class TestCameraInfo:
@@ -108,7 +108,7 @@ class TestCameraInfo:
     )
     def test_what_drivers_leave_out_or_add(self, tmp_path, changes: dict[str, Any]) -> None:
         path = StereoBag(PICTURES, infos(**changes)).write(tmp_path / "b", "mcap")
-        assert_whole(open_sequence(path))
+        assert_whole(open_drive(path))
 
     def test_a_region_of_binned_pixels(self, tmp_path) -> None:
         x, y, binning = 20, 10, 2
@@ -121,14 +121,12 @@ class TestCameraInfo:
             {**info, "k": k, "p": np.c_[k, [shift, 0, 0]], "width": 400, "height": 300, **region}
             for info, shift in zip(INFOS, shifts, strict=True)
         )
-        assert_whole(open_sequence(StereoBag(PICTURES, changed).write(tmp_path / "b", "mcap")))
+        assert_whole(open_drive(StereoBag(PICTURES, changed).write(tmp_path / "b", "mcap")))
 
     def test_an_unknown_lens_does_not_matter_to_rectified_images(self, tmp_path) -> None:
         changed = infos(model="ftheta", d=np.full(3, 0.3))
         topics = ("/s/left/image_rect", "/s/right/image_rect")
-        assert_whole(
-            open_sequence(StereoBag(PICTURES, changed, topics).write(tmp_path / "b", "mcap"))
-        )
+        assert_whole(open_drive(StereoBag(PICTURES, changed, topics).write(tmp_path / "b", "mcap")))
 
     @pytest.mark.parametrize("rectified", [True, False])
     def test_without_p_the_transforms_state_the_baseline(self, tmp_path, rectified: bool) -> None:
@@ -139,7 +137,7 @@ class TestCameraInfo:
                 maker.transform(START_NS, "rig", name, pose)
                 maker.info(topic.replace(kind, "camera_info"), START_NS, {**info, **ZEROS}, name)
             images(maker, topics)
-        assert_whole(open_sequence(tmp_path / "b"))
+        assert_whole(open_drive(tmp_path / "b"))
 
     def test_without_p_turned_cameras_are_rectified(self, tmp_path) -> None:
         turned = SE3.exp([0, 0, 0, 0.0, 0.02, 0.0])
@@ -151,7 +149,7 @@ class TestCameraInfo:
                 place = topic.replace("image_raw", "camera_info")
                 maker.info(place, START_NS, {**info, **ZEROS}, name)
             images(maker)
-        sequence = open_sequence(tmp_path / "b")
+        sequence = open_drive(tmp_path / "b")
         assert isinstance(sequence, BagSequence)
         assert sequence.cameras.raw is not None
         assert sequence.camera.baseline_m == pytest.approx(CAMERA.baseline_m)
@@ -169,12 +167,12 @@ class TestCameraInfo:
                     name,
                 )
             images(maker)
-        assert_whole(open_sequence(tmp_path / "b"))
+        assert_whole(open_drive(tmp_path / "b"))
 
     def test_without_p_and_transforms_the_pair_is_asked_for(self, tmp_path) -> None:
         path = StereoBag(PICTURES, infos(**ZEROS)).write(tmp_path / "b", "mcap")
         with pytest.raises(CalibrationError, match=r"no baseline.*--calibration FILE"):
-            open_sequence(path)
+            open_drive(path)
 
     def test_one_frame_for_both_cameras_is_no_pose(self, tmp_path) -> None:
         with bag(tmp_path / "b", "mcap") as maker:
@@ -183,14 +181,14 @@ class TestCameraInfo:
                 maker.info(topic.replace("image_raw", "camera_info"), START_NS, info, "cam")
             images(maker)
         with pytest.raises(CalibrationError, match="states no baseline"):
-            open_sequence(tmp_path / "b")
+            open_drive(tmp_path / "b")
 
     def test_cameras_above_each_other_name_the_turn(self, tmp_path) -> None:
         p = np.array(INFOS[0]["p"])
         p[1, 3] = -CAMERA.fy * CAMERA.baseline_m
         path = StereoBag(PICTURES, (INFOS[0], {**INFOS[1], "p": p})).write(tmp_path / "b", "mcap")
         with pytest.raises(CalibrationError, match=r"one above the other.*90° anticlockwise"):
-            open_sequence(path)
+            open_drive(path)
 
     @pytest.mark.parametrize(
         "topics",
@@ -207,19 +205,19 @@ class TestCameraInfo:
             for topic, info in zip(topics, INFOS, strict=True):
                 maker.info(topic, START_NS, info)
             maker.info("/colour/camera_info", START_NS, {**INFOS[0], "width": 640, "height": 480})
-        assert_whole(open_sequence(tmp_path / "b"))
+        assert_whole(open_drive(tmp_path / "b"))
 
     def test_scaled_images_name_the_factor(self, tmp_path) -> None:
         changed = infos(width=2 * WIDTH, height=2 * HEIGHT)
         path = StereoBag(PICTURES, changed).write(tmp_path / "b", "mcap")
         with pytest.raises(CalibrationError, match=r"by 0\.5, and state width 48 and height 32"):
-            open_sequence(path)
+            open_drive(path)
 
     def test_two_sizes_are_told_before_anything_else(self, tmp_path) -> None:
         small = {**INFOS[1], "width": WIDTH // 2, "height": HEIGHT // 2}
         path = StereoBag(PICTURES, (INFOS[0], small)).write(tmp_path / "b", "mcap")
         with pytest.raises(CalibrationError, match="needs equal sizes; set both cameras to one"):
-            open_sequence(path)
+            open_drive(path)
 
 
 class TestSignOfTheBaseline:
@@ -242,7 +240,7 @@ class TestSignOfTheBaseline:
         return StereoBag(pairs, (left, {**right, "p": p})).write(folder / "b", "mcap")
 
     def test_it_is_read_where_the_sides_are_in_order(self, tmp_path) -> None:
-        sequence = open_sequence(self.written(tmp_path, exchanged=False))
+        sequence = open_drive(self.written(tmp_path, exchanged=False))
         assert isinstance(sequence, BagSequence)
         assert sequence.camera.baseline_m == pytest.approx(self.CAMERA.baseline_m)
         (note,) = sequence.notes
@@ -252,14 +250,14 @@ class TestSignOfTheBaseline:
     def test_the_hint_for_exchanged_sides_ends_elsewhere(self, tmp_path) -> None:
         path = self.written(tmp_path, exchanged=True)
         with pytest.raises(CalibrationError, match=r"exchange the two folders, or topics"):
-            open_sequence(path)
-        sequence = open_sequence(path, left=RIGHT, right=LEFT)
+            open_drive(path)
+        sequence = open_drive(path, left=RIGHT, right=LEFT)
         np.testing.assert_array_equal(next(iter(sequence)).left, self.STREET[0].left)
 
     def test_the_wrong_hint_does_not_lead_back(self, tmp_path) -> None:
         """Exchanged topics of a wrong sign look right on paper; the doctor sees the images."""
         path = self.written(tmp_path, exchanged=False)
-        sequence = open_sequence(path, left=RIGHT, right=LEFT)
+        sequence = open_drive(path, left=RIGHT, right=LEFT)
         assert sequence.camera.baseline_m == pytest.approx(self.CAMERA.baseline_m)
 
 
@@ -282,7 +280,7 @@ class TestPlanarYuv:
                     planes = np.vstack([image, chroma])
                     maker.image(topic, stamp, planes, encoding, **facts)
                     maker.info(topic.replace("image_raw", "camera_info"), stamp, info)
-        assert_whole(open_sequence(tmp_path / "b"))
+        assert_whole(open_drive(tmp_path / "b"))
 
     def test_a_reason_is_told_once_with_its_count(self, tmp_path) -> None:
         with bag(tmp_path / "b", "mcap") as maker:
@@ -290,7 +288,7 @@ class TestPlanarYuv:
                 for topic, image, info in zip((LEFT, RIGHT), sides, INFOS, strict=True):
                     maker.image(topic, stamp, image, "mono7")
                     maker.info(topic.replace("image_raw", "camera_info"), stamp, info)
-        sequence = open_sequence(tmp_path / "b")
+        sequence = open_drive(tmp_path / "b")
         with pytest.raises(SequenceError, match=rf"image 0: .*\(and {PAIRS - 1} images more\)"):
             list(sequence)
         assert len(sequence.skipped_reasons) == 1
@@ -316,7 +314,7 @@ def test_names_of_pairs(tmp_path, left: str, right: str) -> None:
         images(maker, (left, right))
         for topic, info in zip((left, right), INFOS, strict=True):
             maker.info(f"{topic}_camera_info", START_NS, info)
-    sequence = open_sequence(tmp_path / "b")
+    sequence = open_drive(tmp_path / "b")
     assert_whole(sequence)
     assert (sequence.topics.left, sequence.topics.right) == (left, right)
     assert not sequence.topics.are_rectified
@@ -362,12 +360,12 @@ class TestContainers:
         ]
         notes = [("/notes", "Note", "json")]
         records = [*source.records(), Record("/notes", START_NS, b"{}")]
-        assert_whole(open_sequence(self.mcap(tmp_path / "c.mcap", channels + notes, records)))
+        assert_whole(open_drive(self.mcap(tmp_path / "c.mcap", channels + notes, records)))
 
     def test_mcap_of_nothing_that_is_read(self, tmp_path) -> None:
         path = self.mcap(tmp_path / "c.mcap", [("/a", "foxglove.Image", "protobuf")], [])
         with pytest.raises(SequenceError, match=r"protobuf; only those of ROS 2 \(cdr\) and ROS 1"):
-            open_sequence(path)
+            open_drive(path)
 
     def killed(self, folder: Path) -> Path:
         """A bag whose recorder was killed: the messages lie in the log beside the file."""
@@ -388,7 +386,7 @@ class TestContainers:
 
     def test_a_killed_recorder_on_a_disk_that_is_read_only(self, tmp_path, monkeypatch) -> None:
         path = self.killed(tmp_path)
-        assert_whole(open_sequence(path))
+        assert_whole(open_drive(path))
         (path / "drive_0.db3-shm").unlink(missing_ok=True)
         connect = database._connected
 
@@ -398,12 +396,12 @@ class TestContainers:
             return _Refusing(opened) if file.parent == path else opened  # type: ignore[return-value]
 
         monkeypatch.setattr(database, "_connected", read_only)
-        assert_whole(open_sequence(path))
+        assert_whole(open_drive(path))
         assert sorted(one.name for one in path.iterdir()) == ["drive_0.db3", "drive_0.db3-wal"]
 
     def test_what_a_killed_recorder_of_ros_1_leaves(self, tmp_path) -> None:
         path = WHOLE.write(tmp_path / "b", "ros1").rename(tmp_path / "b.bag.active")
-        assert_whole(open_sequence(path))
+        assert_whole(open_drive(path))
 
 
 class _Refusing:
@@ -440,7 +438,7 @@ class TestSideBySide:
         with pytest.raises(
             SequenceError, match="--left /stereo/image_raw --right /stereo/image_raw"
         ):
-            open_sequence(wide / "wide")
+            open_drive(wide / "wide")
         command = describe_bag(wide / "wide").command
         assert command.endswith(f"--left {self.TOPIC} --right {self.TOPIC} --calibration FILE")
 
@@ -448,11 +446,11 @@ class TestSideBySide:
     def test_a_topic_of_both(self, wide, named: bool) -> None:
         options = {"left": self.TOPIC, "right": self.TOPIC} if named else {}
         calibration = wide / "calibration.toml"
-        assert_whole(open_sequence(wide / "wide", calibration=calibration, **options))
+        assert_whole(open_drive(wide / "wide", calibration=calibration, **options))
 
     def test_the_calibration_is_asked_for(self, wide) -> None:
         with pytest.raises(CalibrationError, match=r"48×32 px.*--calibration FILE"):
-            open_sequence(wide / "wide", left=self.TOPIC, right=self.TOPIC)
+            open_drive(wide / "wide", left=self.TOPIC, right=self.TOPIC)
 
     @pytest.mark.parametrize("name", ["both", "images"])
     @pytest.mark.parametrize("stamped", [True, False])
@@ -466,7 +464,7 @@ class TestSideBySide:
         if not stamped:
             lines = (f"{stamp / 1e9:.9f}\n" for stamp, *_ in PICTURES)
             (tmp_path / "monday/times.txt").write_text("".join(lines))
-        pairs = list(open_sequence(tmp_path / "monday"))
+        pairs = list(open_drive(tmp_path / "monday"))
         assert len(pairs) == PAIRS
         for pair, (_, left, right) in zip(pairs, PICTURES, strict=True):
             np.testing.assert_array_equal(pair.left, left)
@@ -501,7 +499,7 @@ class TestKalibr:
             images(maker, ("/cam1/image_raw", "/cam0/image_raw"))
         chain = self.chain(tmp_path / "camchain.yaml", topics)
         options = {"left": "/cam1/image_raw", "right": "/cam0/image_raw"} if asked else {}
-        sequence = open_sequence(tmp_path / "b", calibration=chain, **options)
+        sequence = open_drive(tmp_path / "b", calibration=chain, **options)
         assert isinstance(sequence, BagSequence)
         assert (sequence.topics.left, sequence.topics.right) == (
             "/cam1/image_raw",
@@ -517,12 +515,12 @@ class TestKalibr:
     def test_topics_that_are_called_left_and_right_stay(self, tmp_path) -> None:
         path = WHOLE.write(tmp_path / "b", "mcap")
         chain = self.chain(tmp_path / "camchain.yaml", topics=False)
-        assert open_sequence(path, calibration=chain).topics.left == LEFT
+        assert open_drive(path, calibration=chain).topics.left == LEFT
 
     def test_compressed_images_are_those_of_the_topic(self, tmp_path) -> None:
         topics = ("/cam1/image_raw", "/cam0/image_raw")
         path = StereoBag(PICTURES, None, topics, png=True).write(tmp_path / "b", "mcap")
-        sequence = open_sequence(path, calibration=self.chain(tmp_path / "camchain.yaml"))
+        sequence = open_drive(path, calibration=self.chain(tmp_path / "camchain.yaml"))
         assert sequence.topics.left == "/cam1/image_raw/compressed"
 
 
@@ -541,7 +539,7 @@ class TestMountingOnTf:
         return made(folder / "b", "mcap")
 
     def test_a_constant_one_is_used_and_told(self, tmp_path) -> None:
-        sequence = open_sequence(self.written(tmp_path, lambda _: self.MOUNT))
+        sequence = open_drive(self.written(tmp_path, lambda _: self.MOUNT))
         mounting = sequence.camera.cam_from_rig
         assert mounting is not None
         np.testing.assert_allclose(mounting.matrix(), self.MOUNT.inverse().matrix(), atol=1e-9)
@@ -549,14 +547,14 @@ class TestMountingOnTf:
 
     def test_a_moving_one_is_told_and_not_used(self, tmp_path) -> None:
         moving = self.written(tmp_path, lambda at: self.MOUNT @ SE3.exp([0, 0, 0, 0, 0.1 * at, 0]))
-        sequence = open_sequence(moving)
+        sequence = open_drive(moving)
         assert sequence.camera.cam_from_rig is None
         assert "/tf moves head during the drive" in sequence.notes[0]
         assert describe_bag(moving).notes == sequence.notes
 
     def test_in_a_namespace(self, tmp_path) -> None:
         path = self.written(tmp_path, lambda _: self.MOUNT, "/robot7/tf_static")
-        sequence = open_sequence(path)
+        sequence = open_drive(path)
         assert sequence.camera.cam_from_rig is not None
         assert sequence.notes == []
 
@@ -583,7 +581,7 @@ class TestFolders:
         ids=["behind", "a letter", "before", "within"],
     )
     def test_names_that_tell_the_side_pair(self, tmp_path, names) -> None:
-        pairs = list(open_sequence(plain_folder(tmp_path / "monday", names)))
+        pairs = list(open_drive(plain_folder(tmp_path / "monday", names)))
         for pair, (_, left, right) in zip(pairs, PICTURES, strict=True):
             np.testing.assert_array_equal(pair.left, left)
             np.testing.assert_array_equal(pair.right, right)
@@ -591,12 +589,12 @@ class TestFolders:
     def test_names_without_anything_in_common_are_asked_for(self, tmp_path) -> None:
         path = plain_folder(tmp_path / "m", lambda at, side: f"{'xy'[side == 'left']}{at}.png")
         with pytest.raises(SequenceError, match="same name on both sides"):
-            open_sequence(path)
+            open_drive(path)
 
     def test_all_images_scaled_name_the_factor(self, tmp_path) -> None:
         path = plain_folder(tmp_path / "m", lambda at, _: f"{at:03d}.png", size=2)
         with pytest.raises(SequenceError, match=r"multiply fx, fy, cx and cy .* by 0\.5") as raised:
-            open_sequence(path)
+            open_drive(path)
         assert "--skip-bad" not in str(raised.value)
 
     def test_skip_bad_is_no_cure_where_all_are_bad(self, tmp_path) -> None:
@@ -604,7 +602,7 @@ class TestFolders:
         for file in (path / "left").iterdir():
             file.write_text("nothing")
         with pytest.raises(SequenceError, match="no readable image") as raised:
-            list(open_sequence(path))
+            list(open_drive(path))
         assert "--skip-bad" not in str(raised.value)
 
     @pytest.mark.parametrize(
@@ -615,36 +613,36 @@ class TestFolders:
         path = plain_folder(tmp_path / "m", lambda at, _: f"{at:03d}.png")
         (path / "times.txt").write_text(f"{stamp}\n" * PAIRS)
         with pytest.raises(SequenceError, match=f"is it in {unit}"):
-            open_sequence(path)
+            open_drive(path)
 
     def test_names_in_milliseconds(self, tmp_path) -> None:
         path = plain_folder(tmp_path / "m", lambda at, _: f"{1_718_000_000_000 + 100 * at}.png")
         (path / "times.txt").unlink()
         with pytest.raises(SequenceError, match=r"stamps in ms.*append 000000"):
-            open_sequence(path)
+            open_drive(path)
 
     def test_a_missing_calibration_names_the_option_and_a_template(self, tmp_path) -> None:
         path = plain_folder(tmp_path / "m", lambda at, _: f"{at:03d}.png")
         (path / "calibration.toml").unlink()
         with pytest.raises(CalibrationError, match="--calibration FILE") as raised:
-            open_sequence(path)
+            open_drive(path)
         # The template is a calibration, once it has the numbers of these images.
         template = str(raised.value).split("\n", 1)[1]
         given = template.replace("1226", str(WIDTH)).replace("370", str(HEIGHT))
         given = given.replace("601.9", "23.5").replace("183.1", "15.5")
         (path / "calibration.toml").write_text(given)
-        assert len(list(open_sequence(path))) == PAIRS
+        assert len(list(open_drive(path))) == PAIRS
 
 
 @pytest.mark.parametrize("name", ["street.mp4", "my drive.AVI"])
 def test_a_video_names_the_command_that_extracts_its_frames(tmp_path, name: str) -> None:
     (tmp_path / name).write_bytes(b"video")
     with pytest.raises(SequenceError, match=r"(?s)is a video.*ffmpeg -i .*/both/%06d\.png"):
-        open_sequence(tmp_path / name)
+        open_drive(tmp_path / name)
 
 
 def test_a_folder_of_images_names_the_layout(tmp_path) -> None:
     (tmp_path / "x").mkdir()
     cv2.imwrite(str(tmp_path / "x" / "0.png"), PICTURES[0][1])
     with pytest.raises(SequenceError, match=r"(?s)into left/.*both/.*times\.txt.*\[rectified\]"):
-        open_sequence(tmp_path / "x")
+        open_drive(tmp_path / "x")

@@ -28,7 +28,7 @@ from engram.frontend.blobs import content_digest
 from engram.geometry import SE3, propagate_covariance
 from engram.graph.model import Clock
 from engram.odometry import OdometryStatus
-from engram.sequences import FrameLog, FrameLogWriter, FrameRange, LoggedFrame, open_sequence
+from engram.sequences import FrameLog, FrameLogWriter, FrameRange, LoggedFrame, open_drive
 
 from .synthetic import (
     PAIRS,
@@ -61,7 +61,7 @@ def assert_same_frame(found: LoggedFrame, wanted: LoggedFrame) -> None:
 
 
 def test_what_is_written_is_read_back_bit_for_bit(tmp_path: Path) -> None:
-    log = open_sequence(write_log(tmp_path / "a.framelog"))
+    log = open_drive(write_log(tmp_path / "a.framelog"))
     assert isinstance(log, FrameLog)
     frames = list(log)
     assert len(log) == len(frames) == PAIRS
@@ -93,7 +93,7 @@ def test_a_log_is_read_from_the_middle(tmp_path: Path) -> None:
 
 
 def test_steps_are_composed_over_skipped_frames(tmp_path: Path) -> None:
-    log = open_sequence(write_log(tmp_path / "a.framelog"), frames="1::2")
+    log = open_drive(write_log(tmp_path / "a.framelog"), frames="1::2")
     frames = list(log)
     assert [frame.frame.stamp_ns for frame in frames] == [stamp_ns(1), stamp_ns(3), stamp_ns(5)]
     assert frames[0].odometry.status is OdometryStatus.FIRST
@@ -113,7 +113,7 @@ def test_steps_are_composed_over_skipped_frames(tmp_path: Path) -> None:
 
 def test_steps_of_three_compose_to_the_whole_way(tmp_path: Path) -> None:
     path = write_log(tmp_path / "a.framelog")
-    last = list(open_sequence(path, frames="0::5"))[-1].odometry
+    last = list(open_drive(path, frames="0::5"))[-1].odometry
     whole = SE3.identity()
     for index in range(1, 6):
         whole = whole @ logged(index).odometry.prev_from_curr
@@ -127,7 +127,7 @@ def test_a_failed_step_makes_the_composed_step_fail(tmp_path: Path, failed: int)
         for index in range(PAIRS)
     ]
     path = write_log(tmp_path / "a.framelog", frames)
-    composed = [frame.odometry for frame in open_sequence(path, frames="1::3")]
+    composed = [frame.odometry for frame in open_drive(path, frames="1::3")]
     assert composed[1].status is OdometryStatus.NO_CONSENSUS
     assert composed[1].prev_from_curr is None
     assert composed[1].inliers == 0
@@ -142,7 +142,7 @@ def test_no_motion_is_lost_across_an_unusable_frame(tmp_path: Path, frames: str)
     ]
     path = write_log(tmp_path / "a.framelog", recorded)
     chosen = [int(index) for index in np.arange(PAIRS)[FrameRange.parse(frames).indices(PAIRS)]]
-    log = open_sequence(path, frames=frames)
+    log = open_drive(path, frames=frames)
     whole = SE3.identity()
     for entry in log:
         if entry.odometry.prev_from_curr is not None:
@@ -161,7 +161,7 @@ def test_a_start_time_makes_a_relative_clock_utc(tmp_path: Path) -> None:
     path = tmp_path / "a.framelog"
     write_log(path)
     with pytest.raises(ConfigError, match="UTC already"):
-        open_sequence(path, start="2020-01-01T00:00:00Z")
+        open_drive(path, recorded_at="2020-01-01T00:00:00Z")
 
 
 def test_recording_goes_on_where_it_stopped(tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_a_full_disk_loses_nothing_that_was_committed(tmp_path: Path) -> None:
 
 def test_a_log_has_no_colours(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="'blue'"):
-        open_sequence(write_log(tmp_path / "a.framelog"), channel="blue")
+        open_drive(write_log(tmp_path / "a.framelog"), channel="blue")
 
 
 def test_frames_must_rise_and_fit(tmp_path: Path) -> None:
@@ -296,7 +296,7 @@ def test_what_is_no_frame_log_is_refused(tmp_path: Path) -> None:
     text = tmp_path / "a.framelog"
     text.write_text("hello, this is no database at all, but it is long enough to be one" * 20)
     with pytest.raises(SequenceError, match="not a frame log"):
-        open_sequence(text)
+        open_drive(text)
     with pytest.raises(SequenceError, match="not a frame log"):
         FrameLogWriter(text, log_header())
     other = tmp_path / "b.framelog"
@@ -304,13 +304,13 @@ def test_what_is_no_frame_log_is_refused(tmp_path: Path) -> None:
         database.execute("CREATE TABLE frames (number INTEGER)")
     database.close()
     with pytest.raises(SequenceError, match="not a frame log"):
-        open_sequence(other)
+        open_drive(other)
     empty = tmp_path / "c.framelog"
     empty.touch()
     with pytest.raises(SequenceError, match="not a frame log"):
-        open_sequence(empty)
+        open_drive(empty)
     with pytest.raises(SequenceError, match="there is no such"):
-        open_sequence(tmp_path / "d.framelog", format="framelog")
+        open_drive(tmp_path / "d.framelog", format="framelog")
 
 
 def test_a_newer_format_is_refused(tmp_path: Path) -> None:
@@ -319,7 +319,7 @@ def test_a_newer_format_is_refused(tmp_path: Path) -> None:
         database.execute("PRAGMA user_version = 99")
     database.close()
     with pytest.raises(FormatVersionError, match=r"format 99.*upgrade"):
-        open_sequence(path)
+        open_drive(path)
 
 
 @pytest.mark.parametrize(
@@ -344,7 +344,7 @@ def test_a_made_up_file_is_refused(tmp_path: Path, hostile: str) -> None:
         database.executescript(hostile)
     database.close()
     with pytest.raises(MapCorruptError, match=r"a\.framelog"):
-        list(open_sequence(path))
+        list(open_drive(path))
 
 
 @pytest.mark.parametrize("gone", [1, PAIRS - 1])
@@ -391,7 +391,7 @@ def test_a_log_cut_short_is_told(tmp_path: Path, keep: float) -> None:
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * keep)])
     with pytest.raises(EngramError, match=r"a\.framelog"):
-        list(open_sequence(path))
+        list(open_drive(path))
 
 
 DAMAGES = [
@@ -411,8 +411,8 @@ def test_a_damaged_frame_is_named_or_skipped(tmp_path: Path, damage: str) -> Non
         database.execute(damage)
     database.close()
     with pytest.raises(MapCorruptError, match=r"a\.framelog.*frame 2"):
-        list(open_sequence(path))
-    log = open_sequence(path, skip_bad=True)
+        list(open_drive(path))
+    log = open_drive(path, skip_bad=True)
     assert [frame.frame.stamp_ns for frame in log] == [stamp_ns(i) for i in (0, 1, 3, 4, 5)]
     assert log.skipped == 1
     assert "frame 2" in log.skipped_reasons[0]
@@ -424,7 +424,7 @@ def test_a_gap_in_the_numbers_is_told(tmp_path: Path) -> None:
         database.execute("DELETE FROM frames WHERE number = 2")
     database.close()
     with pytest.raises(MapCorruptError, match="gaps"):
-        open_sequence(path)
+        open_drive(path)
 
 
 @given(place=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
@@ -437,7 +437,7 @@ def test_a_flipped_byte_gives_our_errors_or_the_same_frames(
     content[int(place * len(content))] ^= flip
     path.write_bytes(content)
     read: list[LoggedFrame] = []
-    error = only_engram_errors(lambda: read.extend(open_sequence(path)))
+    error = only_engram_errors(lambda: read.extend(open_drive(path)))
     for index, frame in enumerate(read):
         assert_same_frame(frame, logged(index))
     assert error is not None or len(read) == PAIRS
@@ -449,7 +449,7 @@ def test_start_shifts_the_stamps_of_a_log_without_a_clock(tmp_path: Path) -> Non
     with FrameLogWriter(path, header) as writer:
         for index in range(PAIRS):
             writer.append(logged(index), pair_hash(index))
-    log = open_sequence(path, start=START_NS + 5, frames="2:4")
+    log = open_drive(path, recorded_at=START_NS + 5, frames="2:4")
     assert log.info.clock is Clock.UTC
     wanted = [START_NS + 5 + index * PERIOD_NS for index in (2, 3)]
     assert [frame.frame.stamp_ns for frame in log] == wanted

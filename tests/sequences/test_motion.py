@@ -10,7 +10,7 @@ import pytest
 
 from engram.errors import SequenceError
 from engram.geometry import SE3
-from engram.sequences import open_sequence
+from engram.sequences import open_drive
 from engram.sequences.bags.inspecting import describe_bag
 from engram.sequences.motion import FORWARD, read_samples
 
@@ -78,7 +78,7 @@ class TestFiles:
         stamps = [CLOCKS[clock](*one) for one in enumerate(samples())]
         rows = [f"{stamp},{SPEED_M_S},{TURN_RAD_S}" for stamp in stamps]
         file.write_text("\n".join(["stamp_ns,forward_m_s,turn_rad_s", *rows]) + "\n")
-        drive = open_sequence(LAYOUTS["folder"].write(tmp_path), motion=[str(file)])
+        drive = open_drive(LAYOUTS["folder"].write(tmp_path), motion=[str(file)])
         assert_moves(drive.motion())
         assert any(str(file) in fact for fact in drive.stamp_facts)
 
@@ -87,7 +87,7 @@ class TestFiles:
         name = "wheels.csv" if write is write_wheels else "wheels.tum"
         file = write(tmp_path / name)
         path = LAYOUTS["folder"].write(tmp_path)
-        assert_moves(open_sequence(path, motion=[str(file)]).motion())
+        assert_moves(open_drive(path, motion=[str(file)]).motion())
 
     def test_a_gyroscope_in_eurocs_form_gives_turns(self, tmp_path) -> None:
         file = tmp_path / "imu.csv"
@@ -95,7 +95,7 @@ class TestFiles:
         rows = [f"{stamp},0.0,0.0,{TURN_RAD_S},9.81" for stamp in samples()]
         file.write_text("\n".join([head, *rows]) + "\n")
         path = LAYOUTS["folder"].write(tmp_path)
-        motion = open_sequence(path, motion=[str(file)]).motion()
+        motion = open_drive(path, motion=[str(file)]).motion()
         assert motion is not None
         found = motion.between(stamp_ns(0), stamp_ns(1))
         assert found is not None
@@ -108,7 +108,7 @@ class TestFiles:
         rows = [f"{stamp},{SPEED_M_S}" for stamp in stamps]
         file.write_text("\n".join(["stamp_ns,forward_m_s", *rows]) + "\n")
         path = LAYOUTS["folder"].write(tmp_path)
-        motion = open_sequence(path, motion=[str(file)]).motion()
+        motion = open_drive(path, motion=[str(file)]).motion()
         assert motion is not None
         assert motion.between(stamp_ns(0), stamp_ns(1)) is not None
         assert motion.between(stamp_ns(1), stamp_ns(2)) is None
@@ -121,7 +121,7 @@ class TestFiles:
             for stamp in samples(START_NS - 10**9, 100)
         ]
         file.write_text("\n".join(["seconds,forward_m_s,turn_rad_s", *rows]) + "\n")
-        drive = open_sequence(path, motion=[str(file)], start=START_NS)
+        drive = open_drive(path, motion=[str(file)], recorded_at=START_NS)
         assert_moves(drive.motion())
 
     @pytest.mark.parametrize(
@@ -140,12 +140,12 @@ class TestFiles:
         with pytest.raises(SequenceError, match=fact):
             read_samples(file)
         with pytest.raises(SequenceError, match=fact):
-            open_sequence(LAYOUTS["folder"].write(tmp_path), motion=[str(file)])
+            open_drive(LAYOUTS["folder"].write(tmp_path), motion=[str(file)])
 
     def test_two_of_a_kind(self, tmp_path) -> None:
         file = write_wheels(tmp_path / "wheels.csv")
         with pytest.raises(SequenceError, match="second odometry"):
-            open_sequence(LAYOUTS["folder"].write(tmp_path), motion=[str(file)] * 2)
+            open_drive(LAYOUTS["folder"].write(tmp_path), motion=[str(file)] * 2)
 
 
 class TestTopics:
@@ -175,13 +175,13 @@ class TestTopics:
             for number, stamp in enumerate(samples()):
                 wrong = CLOCKS[clock](number, stamp)
                 maker.odometry("/odom", wrong, SPEED_M_S, TURN_RAD_S, received_ns=stamp)
-        drive = open_sequence(made(tmp_path / "b", "mcap"), motion=["/odom"])
+        drive = open_drive(made(tmp_path / "b", "mcap"), motion=["/odom"])
         assert_moves(drive.motion())
         assert any("/odom" in fact for fact in drive.stamp_facts)
         assert any("/odom" in fact for fact in describe_bag(tmp_path / "b").stamps)
 
     def test_an_odometry_topic_gives_the_cameras_motion(self, path) -> None:
-        drive = open_sequence(path, motion=["/odom"])
+        drive = open_drive(path, motion=["/odom"])
         assert_moves(drive.motion())
         assert_moves(drive.motion())  # a second pass
 
@@ -195,11 +195,11 @@ class TestTopics:
             for number, stamp in enumerate(samples()):
                 speed_m_s = float("nan") if number % 3 else SPEED_M_S
                 maker.twist("/odom", stamp, speed_m_s, TURN_RAD_S)
-        drive = open_sequence(made(tmp_path / "b", "mcap"), motion=["/odom"])
+        drive = open_drive(made(tmp_path / "b", "mcap"), motion=["/odom"])
         assert_moves(drive.motion())
 
     def test_the_gyroscope_replaces_the_wheels_turn(self, path) -> None:
-        motion = open_sequence(path, motion=["/odom", "/imu/data"]).motion()
+        motion = open_drive(path, motion=["/odom", "/imu/data"]).motion()
         assert motion is not None
         found = motion.between(stamp_ns(0), stamp_ns(1))
         assert found is not None
@@ -208,6 +208,6 @@ class TestTopics:
 
     def test_a_wrong_name_lists_the_right_ones(self, path) -> None:
         with pytest.raises(SequenceError, match=r"/wheels: is neither a topic.*/imu/data"):
-            open_sequence(path, motion=["/wheels"])
+            open_drive(path, motion=["/wheels"])
         with pytest.raises(SequenceError, match="holds sensor_msgs/msg/Image"):
-            open_sequence(path, motion=[LEFT])
+            open_drive(path, motion=[LEFT])

@@ -22,7 +22,7 @@ from engram.sequences import (
     ImageSequence,
     OpenOptions,
     first_pair_hash,
-    open_sequence,
+    open_drive,
     session_of,
 )
 from engram.sequences.folder import find_folder
@@ -115,7 +115,7 @@ class Drive:
         return self.layout.calibration(self.path)
 
     def open(self, **options) -> ImageSequence:
-        sequence = open_sequence(self.path, **options)
+        sequence = open_drive(self.path, **options)
         assert isinstance(sequence, ImageSequence)
         return sequence
 
@@ -235,9 +235,9 @@ class TestGoodDrives:
         start = "2015-06-01T12:00:00+02:00"
         if drive.open().info.clock is Clock.UTC:
             with pytest.raises(ConfigError, match="UTC already"):
-                drive.open(start=start)
+                drive.open(recorded_at=start)
             return
-        pairs = drive.read(start=start, frames="1:3")
+        pairs = drive.read(recorded_at=start, frames="1:3")
         noon_ns = 1_433_152_800 * 10**9
         assert [pair.stamp_ns for pair in pairs] == [noon_ns + PERIOD_NS, noon_ns + 2 * PERIOD_NS]
 
@@ -480,26 +480,26 @@ class TestRecognition:
 
     def test_a_map_where_a_drive_is_expected(self, tmp_path: Path) -> None:
         with pytest.raises(SequenceError, match="the map is given first"):
-            open_sequence(tmp_path / "town.engram")
+            open_drive(tmp_path / "town.engram")
 
     def test_a_path_that_does_not_exist(self, tmp_path: Path) -> None:
         with pytest.raises(SequenceError, match="there is no such"):
-            open_sequence(tmp_path / "nowhere")
+            open_drive(tmp_path / "nowhere")
 
     @pytest.mark.parametrize("kind", ["empty folder", "text file"])
     def test_a_path_that_is_no_drive_lists_what_is_known(self, tmp_path: Path, kind: str) -> None:
         path = tmp_path / "x"
         path.mkdir() if kind == "empty folder" else path.write_text("hello")
         with pytest.raises(SequenceError) as caught:
-            open_sequence(path)
+            open_drive(path)
         assert all(name in str(caught.value) for name in SEQUENCES)
 
     def test_a_path_that_is_two_things_is_not_guessed(self, tmp_path: Path) -> None:
         path = LAYOUTS["folder"].write(tmp_path)
         (path / "cam0").mkdir()
         with pytest.raises(SequenceError, match=r"euroc or folder.*--format"):
-            open_sequence(path)
-        assert len(list(open_sequence(path, format="folder"))) == PAIRS
+            open_drive(path)
+        assert len(list(open_drive(path, format="folder"))) == PAIRS
 
     @pytest.mark.parametrize(
         "options", [{"format": "mp4"}, {"rig": "left"}, {"channel": "infrared"}, {"frames": "a"}]
@@ -507,54 +507,54 @@ class TestRecognition:
     def test_unknown_names_are_refused(self, tmp_path: Path, options: dict) -> None:
         path = LAYOUTS["folder"].write(tmp_path)
         with pytest.raises(ConfigError):
-            open_sequence(path, **options)
+            open_drive(path, **options)
 
     @pytest.mark.parametrize("name", ["kitti", "kitti-raw"])
     def test_a_missing_rig_points_to_the_other(self, tmp_path: Path, name: str) -> None:
         path = LAYOUTS[name].write(tmp_path)
         with pytest.raises(SequenceError, match="choose rig 'grey'"):
-            open_sequence(path, rig="colour")
+            open_drive(path, rig="colour")
 
     @pytest.mark.parametrize("folder", ["", "mav0"])
     def test_euroc_may_be_named_by_its_inner_folder(self, tmp_path: Path, folder: str) -> None:
-        drive = open_sequence(LAYOUTS["euroc"].write(tmp_path) / folder)
+        drive = open_drive(LAYOUTS["euroc"].write(tmp_path) / folder)
         assert (drive.info.name, drive.info.format, len(drive)) == ("V9_01", "euroc", PAIRS)
 
     def test_euroc_without_its_left_camera_is_known_and_the_file_named(self, tmp_path) -> None:
         path = LAYOUTS["euroc"].write(tmp_path)
         shutil.rmtree(path / "mav0" / "cam0")
         with pytest.raises(CalibrationError, match=r"cam0.*missing"):
-            open_sequence(path)
+            open_drive(path)
 
     def test_places_and_robots_come_from_the_caller_or_the_files(self, tmp_path: Path) -> None:
         path = LAYOUTS["folder"].write(tmp_path)
         file = path / "calibration.toml"
         file.write_text('robot = "husky"\nlongitude_deg = 8.4\n' + file.read_text())
-        info = open_sequence(path).info
+        info = open_drive(path).info
         assert (info.robot, info.longitude_deg, info.zone) == ("husky", 8.4, None)
-        info = open_sequence(path, robot="jackal", longitude_deg=-1.26, zone="Europe/London").info
+        info = open_drive(path, robot="jackal", longitude_deg=-1.26, zone="Europe/London").info
         assert (info.robot, info.longitude_deg, info.zone) == ("jackal", -1.26, "Europe/London")
         with pytest.raises(ConfigError, match="longitude"):
-            open_sequence(path, longitude_deg=200)
+            open_drive(path, longitude_deg=200)
         with pytest.raises(ConfigError, match="time zone"):
-            open_sequence(path, zone="Mars/Olympus_Mons")
+            open_drive(path, zone="Mars/Olympus_Mons")
 
     def test_kitti_raw_takes_the_longitude_from_gps(self, tmp_path: Path) -> None:
         path = LAYOUTS["kitti-raw"].write(tmp_path)
         record = path / "oxts" / "data" / "0000000000.txt"
         record.parent.mkdir(parents=True)
         record.write_text("49.015003823272 8.4342971002335 116.43032836914 0.035752")
-        assert open_sequence(path).info.longitude_deg == 8.4342971002335
+        assert open_drive(path).info.longitude_deg == 8.4342971002335
 
 
 def test_pairs_by_stamp_bear_a_small_difference_only(tmp_path: Path) -> None:
     path = LAYOUTS["folder, named by stamp"].write(tmp_path)
     for index, file in enumerate(sorted((path / "right").iterdir())):
         file.rename(file.with_name(f"{int(file.stem) + (index - 1) * 1_000_000}.png"))
-    assert len(list(open_sequence(path))) == PAIRS
+    assert len(list(open_drive(path))) == PAIRS
     with pytest.raises(SequenceError, match=r"no right image within 2\.5 ms \(the nearest is 3\.0"):
-        open_sequence(path, pair_tolerance_ns=2_500_000)
-    assert len(list(open_sequence(path, pair_tolerance_ns=2_500_000, skip_bad=True))) == 4
+        open_drive(path, pair_tolerance_ns=2_500_000)
+    assert len(list(open_drive(path, pair_tolerance_ns=2_500_000, skip_bad=True))) == 4
 
 
 def test_raw_folders_are_rectified(tmp_path: Path) -> None:
@@ -579,7 +579,7 @@ def test_raw_folders_are_rectified(tmp_path: Path) -> None:
         cy = 15.5
         """
     )
-    drive = open_sequence(path)
+    drive = open_drive(path)
     assert drive.rectification is not None
     assert drive.camera.rectification
     assert drive.camera.baseline_m == pytest.approx(0.1)
@@ -591,7 +591,7 @@ def test_an_unknown_key_of_a_calibration_is_refused(tmp_path: Path) -> None:
     path = LAYOUTS["folder"].write(tmp_path)
     _edit(path / "calibration.toml", "baseline_m", "basline_m")
     with pytest.raises(CalibrationError, match=r"calibration\.toml.*rectified\.basline_m"):
-        open_sequence(path)
+        open_drive(path)
 
 
 # Mangled files: nothing but our own errors, whatever the bytes.
@@ -656,7 +656,7 @@ def test_images_of_any_kind_are_read(tmp_path: Path, suffix: str) -> None:
             old = LAYOUTS["kitti"].image(path, index, side)
             old.unlink()
             write_image(old.with_suffix(suffix), smooth)
-    for pair in open_sequence(path):
+    for pair in open_drive(path):
         # JPEG and WebP lose a few grey levels, the others none.
         atol = 8 if suffix in {".jpg", ".jpeg", ".webp"} else 0
         np.testing.assert_allclose(pair.left.astype(int), smooth, atol=atol)
@@ -668,13 +668,13 @@ def test_absurd_numbers_in_a_calibration_are_refused(tmp_path, name: str, number
     path = LAYOUTS["folder"].write(tmp_path)
     _edit(path / "calibration.toml", name, f"{name.partition(' ')[0]} = {number}")
     with pytest.raises(CalibrationError, match=r"calibration\.toml"):
-        open_sequence(path)
+        open_drive(path)
 
 
 def test_a_gigapixel_first_image_does_not_set_the_size(tmp_path: Path) -> None:
     path = LAYOUTS["kitti"].write(tmp_path)
     _gigapixel(LAYOUTS["kitti"].image(path, 0, 0))
-    drive = open_sequence(path, skip_bad=True)
+    drive = open_drive(path, skip_bad=True)
     assert (drive.camera.width, drive.camera.height) == (WIDTH, HEIGHT)
     assert len(list(drive)) == PAIRS - 1
 
@@ -687,14 +687,14 @@ class TestFirstHour:
         path = LAYOUTS[name].write(tmp_path)
         (tmp_path / "notes.txt").write_text("sunny")
         with pytest.raises(SequenceError, match="holds some; name one of") as caught:
-            open_sequence(tmp_path)
+            open_drive(tmp_path)
         assert str(path) in str(caught.value)
 
     def test_many_drives_are_counted(self, tmp_path: Path) -> None:
         for number in range(12):
             (tmp_path / f"drive_{number:02d}" / "mav0" / "cam0").mkdir(parents=True)
         with pytest.raises(SequenceError, match="and 2 more"):
-            open_sequence(tmp_path)
+            open_drive(tmp_path)
 
     def test_frame_numbers_are_not_taken_for_stamps(self, tmp_path: Path) -> None:
         path = LAYOUTS["folder"].write(tmp_path)
@@ -703,36 +703,36 @@ class TestFirstHour:
             for index, file in enumerate(sorted((path / side).iterdir())):
                 file.rename(file.with_name(f"{index:06d}.png"))
         with pytest.raises(SequenceError, match=r"000000\.png.*frame numbers.*times\.txt"):
-            open_sequence(path)
+            open_drive(path)
         (path / "times.txt").write_text("".join(f"{0.1 * i:.1f}\n" for i in range(PAIRS)))
-        assert len(list(open_sequence(path))) == PAIRS
+        assert len(list(open_drive(path))) == PAIRS
 
     def test_9_comes_before_10(self, tmp_path: Path) -> None:
         path = LAYOUTS["folder"].write(tmp_path)
-        padded = [pair.left.tobytes() for pair in open_sequence(path)]
+        padded = [pair.left.tobytes() for pair in open_drive(path)]
         for side in ("left", "right"):
             for index, file in enumerate(sorted((path / side).iterdir())):
                 file.rename(file.with_name(f"frame{index + 8}.png"))
-        assert [pair.left.tobytes() for pair in open_sequence(path)] == padded
+        assert [pair.left.tobytes() for pair in open_drive(path)] == padded
 
     def test_pairs_lost_on_both_sides_leave_later_stamps_alone(self, tmp_path: Path) -> None:
         path = LAYOUTS["folder"].write(tmp_path)
-        stamps_ns = [pair.stamp_ns for pair in open_sequence(path)]
+        stamps_ns = [pair.stamp_ns for pair in open_drive(path)]
         for side in ("left", "right"):
             files = sorted((path / side).iterdir())
             for index, file in enumerate(files):
                 file.rename(file.with_name(f"{index}.png"))
             (path / side / "1.png").unlink()
         with pytest.raises(SequenceError, match="image 1 is missing"):
-            open_sequence(path)
-        found = [pair.stamp_ns for pair in open_sequence(path, skip_bad=True)]
+            open_drive(path)
+        found = [pair.stamp_ns for pair in open_drive(path, skip_bad=True)]
         assert found == stamps_ns[:1] + stamps_ns[2:]
 
     def test_both_spellings_are_known(self, tmp_path: Path) -> None:
         path = LAYOUTS["kitti"].write(tmp_path)
         with pytest.raises(SequenceError, match="colour rig"):
-            open_sequence(path, rig="color")
-        assert isinstance(open_sequence(path, rig="gray", channel="gray"), ImageSequence)
+            open_drive(path, rig="color")
+        assert isinstance(open_drive(path, rig="gray", channel="gray"), ImageSequence)
 
 
 def _folder(path: Path, frames: FrameRange) -> ImageSequence:

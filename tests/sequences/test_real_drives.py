@@ -16,7 +16,7 @@ from engram.sequences import (
     FrameLogWriter,
     LoggedFrame,
     first_pair_hash,
-    open_sequence,
+    open_drive,
     session_of,
 )
 
@@ -28,7 +28,7 @@ RAW_DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync"
 
 
 def test_kitti_odometry_06(data_dir: Path) -> None:
-    drive = open_sequence(data_dir / "kitti_odometry/sequences/06")
+    drive = open_drive(data_dir / "kitti_odometry/sequences/06")
     pairs = list(drive)
     assert len(drive) == len(pairs) == 51
     assert all(pair.left.shape == pair.right.shape == (370, 1226) for pair in pairs)
@@ -40,8 +40,8 @@ def test_kitti_odometry_06(data_dir: Path) -> None:
 
 
 def test_kitti_raw_has_two_rigs_that_stand_apart_as_stated(data_dir: Path) -> None:
-    grey = open_sequence(data_dir / RAW_DRIVE)
-    colour = open_sequence(data_dir / RAW_DRIVE, rig="colour")
+    grey = open_drive(data_dir / RAW_DRIVE)
+    colour = open_drive(data_dir / RAW_DRIVE, rig="colour")
     assert len(grey) == len(colour) == 54
     assert grey.camera.baseline_m == pytest.approx(0.5372, abs=1e-4)
     assert colour.camera.baseline_m == pytest.approx(0.5327, abs=1e-4)
@@ -58,7 +58,7 @@ def test_kitti_raw_has_two_rigs_that_stand_apart_as_stated(data_dir: Path) -> No
 
 def test_one_colour_channel_looks_unlike_grey(data_dir: Path) -> None:
     images = {
-        channel: open_sequence(data_dir / RAW_DRIVE, rig="colour", channel=channel).read(0).left
+        channel: open_drive(data_dir / RAW_DRIVE, rig="colour", channel=channel).read(0).left
         for channel in ("grey", "red", "green", "blue")
     }
     grey = images["grey"].astype(float)
@@ -69,7 +69,7 @@ def test_one_colour_channel_looks_unlike_grey(data_dir: Path) -> None:
 
 def test_euroc_rectifies_to_the_reference(data_dir: Path) -> None:
     folder = data_dir / "euroc/V1_01_easy_sparse"
-    drive = open_sequence(folder)
+    drive = open_drive(folder)
     reference = json.loads((folder / "rectified_calibration_for_reference.json").read_text())
     assert drive.rectification is not None
     np.testing.assert_allclose(
@@ -85,7 +85,7 @@ def test_euroc_rectifies_to_the_reference(data_dir: Path) -> None:
 
 
 def test_rectified_rows_agree(data_dir: Path) -> None:
-    drive = open_sequence(data_dir / "euroc/V1_01_easy_sparse", frames="::6")
+    drive = open_drive(data_dir / "euroc/V1_01_easy_sparse", frames="::6")
     orb = cv2.ORB_create(1000)
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
     row_offsets = []
@@ -102,7 +102,7 @@ def test_rectified_rows_agree(data_dir: Path) -> None:
 
 
 def test_at_rest_the_pictures_stay(data_dir: Path) -> None:
-    pairs = list(open_sequence(data_dir / "euroc/V1_01_easy_at_rest"))
+    pairs = list(open_drive(data_dir / "euroc/V1_01_easy_at_rest"))
     assert len(pairs) == 10
     first = pairs[0].left.astype(np.float32)
     for pair in pairs:
@@ -112,7 +112,7 @@ def test_at_rest_the_pictures_stay(data_dir: Path) -> None:
 
 
 def test_a_log_stands_for_its_drive(data_dir: Path, tmp_path: Path) -> None:
-    drive = open_sequence(data_dir / "kitti_odometry/sequences/06", frames=":5")
+    drive = open_drive(data_dir / "kitti_odometry/sequences/06", frames=":5")
     frontend, odometry = Frontend(), Odometry()
     path = tmp_path / "06.framelog"
     wanted, writer = [], None
@@ -124,7 +124,7 @@ def test_a_log_stands_for_its_drive(data_dir: Path, tmp_path: Path) -> None:
         wanted.append(LoggedFrame(frame, odometry.step(frame)))
         writer.append(wanted[-1], first_pair_hash(pair))
     writer.close(complete=True)
-    log = open_sequence(path)
+    log = open_drive(path)
     for found, made in zip(log, wanted, strict=True):
         for name in type(made.frame.landmarks).__slots__:
             np.testing.assert_array_equal(
@@ -142,19 +142,19 @@ def test_a_log_stands_for_its_drive(data_dir: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("frames", [None, "10:30:3"])
 def test_the_same_drive_has_the_same_first_pair(data_dir: Path, frames: str | None) -> None:
     path = data_dir / "kitti_odometry/sequences/06"
-    once, again = (next(iter(open_sequence(path, frames=frames))) for _ in range(2))
+    once, again = (next(iter(open_drive(path, frames=frames))) for _ in range(2))
     assert first_pair_hash(once) == first_pair_hash(again)
-    other = open_sequence(path).read(7)
+    other = open_drive(path).read(7)
     assert first_pair_hash(other) != first_pair_hash(once)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "sqlite", "mcap"])
 @pytest.mark.parametrize("png", [False, True])
 def test_a_bag_of_kitti_06_holds_the_folders_frames(data_dir, tmp_path, kind, png) -> None:
-    drive = open_sequence(data_dir / "kitti_odometry/sequences/06", frames="::10")
+    drive = open_drive(data_dir / "kitti_odometry/sequences/06", frames="::10")
     pairs = [(pair.stamp_ns, pair.left, pair.right) for pair in drive]
     made = StereoBag(pairs, rectified_infos(drive.camera), png=png).write(tmp_path / "b", kind)
-    bag = open_sequence(made)
+    bag = open_drive(made)
     assert bag.camera.fx == drive.camera.fx
     assert bag.camera.baseline_m == drive.camera.baseline_m
     for found, (stamp_ns, left, right) in zip(bag, pairs, strict=True):
@@ -167,7 +167,7 @@ def test_a_raw_bag_of_euroc_with_a_kalibr_chain_is_rectified_as_the_folder(
     data_dir: Path, tmp_path: Path
 ) -> None:
     folder = data_dir / "euroc/V1_01_easy_sparse"
-    drive = open_sequence(folder, frames="::9")
+    drive = open_drive(folder, frames="::9")
     raw = drive.cameras.raw
     topics = ("/cam0/image_raw", "/cam1/image_raw")
     wanted = list(drive)
@@ -184,7 +184,7 @@ def test_a_raw_bag_of_euroc_with_a_kalibr_chain_is_rectified_as_the_folder(
     made = StereoBag(pairs, None, topics=topics).write(tmp_path / "b", "ros1")
     chain = tmp_path / "camchain.yaml"
     chain.write_text(kalibr_chain(raw, topics))
-    bag = open_sequence(made, calibration=chain)
+    bag = open_drive(made, calibration=chain)
     assert bag.camera.fx == pytest.approx(drive.camera.fx, abs=1e-6)
     assert bag.camera.cam_from_rig is not None
     for found, pair in zip(bag, wanted, strict=True):

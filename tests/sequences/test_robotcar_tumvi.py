@@ -14,7 +14,7 @@ from engram.errors import CalibrationError, SequenceError
 from engram.frontend import StereoPair
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Clock
-from engram.sequences import ImageSequence, open_sequence, session_of
+from engram.sequences import ImageSequence, open_drive, session_of
 
 from .synthetic import HEIGHT, WIDTH, camera, picture, write_image
 
@@ -54,7 +54,7 @@ def write_robotcar(
 
 class TestRobotCar:
     def test_pairs_are_debayered_and_rectified_by_the_tables(self, tmp_path) -> None:
-        drive = open_sequence(write_robotcar(tmp_path))
+        drive = open_drive(write_robotcar(tmp_path))
         assert isinstance(drive, ImageSequence)
         assert drive.info.format == "robotcar"
         assert len(drive) == PAIRS
@@ -65,18 +65,18 @@ class TestRobotCar:
         np.testing.assert_array_equal(pair.left[:, :-2], grey[:, 2:])
 
     def test_the_camera_is_the_wide_pair(self, tmp_path) -> None:
-        camera = open_sequence(write_robotcar(tmp_path)).camera
+        camera = open_drive(write_robotcar(tmp_path)).camera
         assert (camera.fx, camera.cx, camera.baseline_m) == (40.0, 23.5, 0.24)
 
     def test_other_tables_are_another_camera(self, tmp_path) -> None:
         (tmp_path / "a").mkdir()
         (tmp_path / "b").mkdir()
-        one = open_sequence(write_robotcar(tmp_path / "a"))
-        other = open_sequence(write_robotcar(tmp_path / "b", shift_px=1.0))
+        one = open_drive(write_robotcar(tmp_path / "a"))
+        other = open_drive(write_robotcar(tmp_path / "b", shift_px=1.0))
         assert one.camera != other.camera
 
     def test_the_hour_is_that_of_the_sun_at_oxford(self, tmp_path) -> None:
-        drive = open_sequence(write_robotcar(tmp_path))
+        drive = open_drive(write_robotcar(tmp_path))
         assert drive.info.clock is Clock.UTC
         session = session_of(drive.info, drive.camera, START_US * 1000, "")
         assert hour_of_day(session, START_US * 1000) == pytest.approx(13.303, abs=0.001)
@@ -84,25 +84,25 @@ class TestRobotCar:
     def test_images_without_a_partner_are_left_out(self, tmp_path) -> None:
         path = write_robotcar(tmp_path)
         (path / "stereo" / "right" / f"{START_US}.png").unlink()
-        assert len(open_sequence(path)) == PAIRS - 1
+        assert len(open_drive(path)) == PAIRS - 1
 
     def test_a_missing_side_is_named(self, tmp_path) -> None:
         path = write_robotcar(tmp_path)
         shutil.rmtree(path / "stereo" / "right")
         with pytest.raises(SequenceError, match="right: the image folder is missing"):
-            open_sequence(path)
+            open_drive(path)
 
     def test_missing_models_say_where_to_get_them(self, tmp_path) -> None:
         path = write_robotcar(tmp_path)
         (tmp_path / "models" / "stereo_wide_left.txt").unlink()
         with pytest.raises(CalibrationError, match=r"models.*software kit"):
-            open_sequence(path)
+            open_drive(path)
 
     def test_a_table_of_another_size_is_refused(self, tmp_path) -> None:
         path = write_robotcar(tmp_path)
         (tmp_path / "models" / "stereo_wide_right_distortion_lut.bin").write_bytes(bytes(80))
         with pytest.raises(CalibrationError, match=r"80 bytes, must be 16 for each of 48×32"):
-            open_sequence(path)
+            open_drive(path)
 
 
 CAMCHAIN = """cam0:
@@ -145,7 +145,7 @@ class TestTumVi:
         return write_tumvi(tmp_path)
 
     def test_it_is_told_from_euroc_and_rectified_to_a_pinhole(self, path: Path) -> None:
-        drive = open_sequence(path, field_of_view_deg=80.0)
+        drive = open_drive(path, field_of_view_deg=80.0)
         assert isinstance(drive, ImageSequence)
         assert drive.info.format == "tum-vi"
         assert len(list(drive)) == PAIRS

@@ -16,7 +16,7 @@ __all__ = ["engram"]
 @pytest.fixture(scope="module")
 def centre(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("fleet") / "centre.engram"
-    sequence = open_drive(street, start="2026-03-01T09:30:00", longitude_deg=0.0)
+    sequence = open_drive(street, recorded_at="2026-03-01T09:30:00", longitude_deg=0.0)
     map_drive(path, sequence, Settings(), RobotOptions())
     return path
 
@@ -25,7 +25,7 @@ def centre(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def night(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same street by night, of which the centre has seen nothing."""
     log = tmp_path_factory.mktemp("drives") / "night.framelog"
-    sequence = open_drive(street, robot="r2", start="2026-03-02T22:30:00", longitude_deg=0.0)
+    sequence = open_drive(street, robot="r2", recorded_at="2026-03-02T22:30:00", longitude_deg=0.0)
     extract_log(sequence, log, Settings())
     return log
 
@@ -34,7 +34,7 @@ def night(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def morning(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The street in the centre's morning."""
     log = tmp_path_factory.mktemp("drives") / "morning.framelog"
-    sequence = open_drive(street, robot="r2", start="2026-03-02T09:30:00", longitude_deg=0.0)
+    sequence = open_drive(street, robot="r2", recorded_at="2026-03-02T09:30:00", longitude_deg=0.0)
     extract_log(sequence, log, Settings())
     return log
 

@@ -60,6 +60,6 @@ def few_options(**changes) -> RankingOptions:
         "live_folds": 0,
         "map_sizes": False,
         # One core and a second are enough on so short a road.
-        "build": RobotOptions(policy="path-near", lanes=2, rounds=4, relocaliser="exhaustive"),
+        "build": RobotOptions(ranking="path-near", lanes=2, rounds=4, relocaliser="exhaustive"),
     }
     return RankingOptions(**{**values, **changes})

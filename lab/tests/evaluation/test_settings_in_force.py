@@ -425,7 +425,7 @@ def test_arms_are_those_of_the_settings_where_these_set_what_arms_do() -> None:
 def test_an_arm_leaves_to_the_settings_what_it_does_not_set(drives, tmp_path: Path) -> None:
     plan = make_fleet_plan(drives, paper("gadd2016"), replace(FLEET, arms=("A", "P")), tmp_path)
     for arm, sure_inliers in zip(plan.arms, (0, 0), strict=True):
-        assert (arm.driving.policy, arm.merging.ranking) == ("distance", "distance")
+        assert (arm.driving.ranking, arm.merging.ranking) == ("distance", "distance")
         assert (arm.merging.lanes, arm.merging.rounds) == (2, 4)
         assert (arm.merging.unit, arm.merging.seed) == ("segment", "places")
         assert arm.merging.sure_inliers == sure_inliers
@@ -501,7 +501,7 @@ def test_robots_merges_and_held_out_drives_of_a_fleet_have_every_setting(
         options = mapped[-1][0][3]
         table = key.partition(".")[0]
         if table == "drive":
-            asked = {"ranking": options.policy, "lanes": options.lanes, "rounds": options.rounds}
+            asked = {"ranking": options.ranking, "lanes": options.lanes, "rounds": options.rounds}
             assert {**asked, "threads": options.threads}[name] == value
             configuration = held_out[-1][0][4][0]
             if name in asked:
@@ -544,8 +544,7 @@ def test_downloads_and_orders_of_a_fleet_have_every_setting(
         elif table == "build":
             assert {"max_gap_m": judge.judge_at_m, "estimator": judge.estimator}[name] == value
         else:
-            attribute = {"ranking": "policy"}.get(name, name)
-            assert getattr(driving, attribute) == getattr(judge.localising, attribute) == value
+            assert getattr(driving, name) == getattr(judge.localising, name) == value
 
 
 def test_a_study_by_the_command_line_says_what_it_ran_by(engram, campaign, tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ MAP_VERBS = [
     "localise MAP LOG --explain 1",
     "map MAP LOG",
     "live MAP --calibration nothing",
-    "view MAP LOG --save out.rrd",
+    "view MAP LOG --view out.rrd",
     "lab places MAP",
     "lab relocalise MAP LOG",
     "lab try MAP LOG",

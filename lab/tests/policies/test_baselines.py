@@ -28,7 +28,7 @@ class TestOracle:
 
     def test_a_drive_is_refused(self) -> None:
         with pytest.raises(ConfigError, match="engram lab evaluate"):
-            RobotOptions(policy="oracle")
+            RobotOptions(ranking="oracle")
 
     def test_a_context_without_foresight_is_refused(self) -> None:
         with pytest.raises(ConfigError, match="engram lab evaluate"):

@@ -12,7 +12,7 @@ from engram.errors import ConfigError, IncompatibleError, SequenceError, WorkerE
 from engram.frontend import FrontendConfig
 from engram.monitor import Monitor
 from engram.robot import Settings
-from engram.sequences import FrameLog, open_sequence, session_of
+from engram.sequences import FrameLog, open_drive, session_of
 from engram.sequences.sequence import first_pair_hash
 from engram_lab.town import Campaign, campaign_named
 from engram_lab.town.sequence import SimulatedSequence
@@ -193,7 +193,7 @@ def test_a_worker_that_dies_is_told_and_the_same_call_goes_on(
 def test_images_in_kitti_layout_read_back_as_rendered(short: Campaign, tmp_path: Path) -> None:
     one = replace(short, spacing_m=30.0)
     folder = Path(simulate(one, tmp_path, images=True, sessions=[2]).files[0])
-    sequence = open_sequence(folder)
+    sequence = open_drive(folder)
     rendered = SimulatedSequence(one, 2)
     for name in ("fx", "fy", "cx", "cy", "baseline_m", "width", "height"):
         assert getattr(sequence.camera, name) == pytest.approx(getattr(rendered.camera, name))

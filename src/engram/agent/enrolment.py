@@ -84,7 +84,7 @@ def enrolled(folder: Path) -> AgentState:
         state.close()
     raise InputError(
         f"{folder} is not the folder of an enrolled robot; enrol it: engram agent enrol {folder} "
-        "URL CODE --name NAME"
+        "URL CODE --robot NAME"
     )
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 agent_group = typer.Typer(
     help="The robot's side of the centre.",
-    epilog="Start with: engram agent enrol FOLDER URL CODE --name r1",
+    epilog="Start with: engram agent enrol FOLDER URL CODE --robot r1",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -48,7 +48,7 @@ def enrol(
     url: Annotated[str, typer.Argument(metavar="URL", help="Address of the centre.")],
     code: Annotated[str, typer.Argument(metavar="CODE", help="What engram centre code printed.")],
     *,
-    name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the robot.")],
+    robot: Annotated[str, typer.Option("--robot", metavar="NAME", help="Name of the robot.")],
 ) -> None:
     """Enrol this robot with a centre.
 
@@ -56,11 +56,11 @@ def enrol(
 
     \b
     Examples:
-      engram agent enrol r1 https://town.example:8440 CODE --name r1
+      engram agent enrol r1 https://town.example:8440 CODE --robot r1
     """
     from engram.agent import enrol as enrol_robot
 
-    typer.echo(f"{name} is a robot of {enrol_robot(folder, url, code, name)}")
+    typer.echo(f"{robot} is a robot of {enrol_robot(folder, url, code, robot)}")
 
 
 @agent_group.command()

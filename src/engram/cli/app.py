@@ -11,7 +11,7 @@ import typer
 
 from engram import __version__
 from engram.cli.endings import ExitStatus, PartlyDoneError, VerbInterruptedError
-from engram.cli.moved import moved_option
+from engram.cli.moved import SPELLINGS, moved_option
 from engram.cli.screen import UnwritableError, forget, screen
 from engram.cli.verbs import Program, register
 from engram.errors import EngramError, InputError, UnfitDriveError
@@ -102,7 +102,8 @@ def _moved(error: Any) -> str | None:
     option = getattr(error, "option_name", None)
     if option is None or error.ctx is None:
         return None
-    return moved_option(error.ctx.command.name, option)
+    typed = error.ctx.command_path.split()[1:]
+    return moved_option(" ".join(SPELLINGS.get(word, word) for word in typed), option)
 
 
 def _status_of(error: EngramError | VerbInterruptedError) -> int:

@@ -98,7 +98,7 @@ def calibration(
     \b
     Examples:
       engram drive calibration monday.bag > calibration.toml
-      engram drive calibration monday.bag --calibration calibration.toml --fov 90
+      engram drive calibration monday.bag --calibration calibration.toml --field-of-view 90
     """
     import cv2
 

@@ -25,7 +25,7 @@ def map_(
     *,
     drive: options.Drive,
     effort: options.Effort,
-    descriptor: options.Descriptor = None,
+    features: options.Features = None,
     no_thumbnails: options.NoThumbnails = False,
     force: Annotated[
         bool, typer.Option("--force", help="Map the drive even if the doctor finds it unfit.")
@@ -55,8 +55,8 @@ def map_(
     sequence = drive.open(path)
     given = settings.read()
     asked = RobotOptions(**effort.over(given), force=force)
-    resolved = _for_people(given.of_robot(descriptor), no_thumbnails)
-    descriptor = descriptor or _asked_kind(resolved)
+    resolved = _for_people(given.of_robot(features), no_thumbnails)
+    features = features or _asked_kind(resolved)
     with losses_told(sequence):
         with viewer_for(view) as viewer, Bars().stage("map", len(sequence)) as monitor:
 
@@ -64,7 +64,7 @@ def map_(
                 if viewer is not None:
                     viewer.watch(begun.robot, begun.opened)
 
-            report = map_drive(map_path, sequence, resolved, asked, monitor, begin, descriptor)
+            report = map_drive(map_path, sequence, resolved, asked, monitor, begin, features)
         if as_json:
             print(json.dumps(report.to_dict()))
         else:
@@ -179,7 +179,7 @@ def localise(
     }  # fmt: skip
     for option in (option for option, value in refused.items() if value is not None):
         raise ConfigError(f"--explain is about one frame and takes no {option}")
-    frame = ExplainOptions(explain, tried["policy"], tried["lanes"], tried["rounds"], found_by, at)
+    frame = ExplainOptions(explain, tried["ranking"], tried["lanes"], tried["rounds"], found_by, at)
     explain_and_print(map_path, sequence, resolved, frame, as_json=as_json)
 
 
@@ -193,7 +193,7 @@ def record(
     ],
     *,
     drive: options.Drive,
-    descriptor: options.Descriptor = None,
+    features: options.Features = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
@@ -211,7 +211,7 @@ def record(
     from engram.cli.progress import Bars
     from engram.robot import extract_log
 
-    sequence, resolved = drive.open(path), settings.read().of_robot(descriptor)
+    sequence, resolved = drive.open(path), settings.read().of_robot(features)
     with losses_told(sequence):
         with Bars().stage("record", len(sequence)) as monitor:
             report = extract_log(sequence, out, resolved, monitor)

@@ -39,7 +39,7 @@ def _print(found: Explanation) -> None:
         f"frame {found.frame}: {found.status.value.replace('_', ' ')}; "
         f"{len(found.candidates)} candidates, "
         f"{sum(one.would_match for one in found.candidates)} would match; "
-        f"ordered by {found.policy}"
+        f"ordered by {found.ranking}"
     )
     if not found.candidates:
         typer.echo("nothing to rank: the robot is lost, or the frame is unusable")

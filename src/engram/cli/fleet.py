@@ -322,7 +322,7 @@ def build(
         grouping=how,
         seed=seed,
         mapping=RobotOptions(
-            policy=merging.ranking,
+            ranking=merging.ranking,
             lanes=merging.lanes,
             rounds=merging.rounds,
             relocaliser=merging.relocaliser_name,

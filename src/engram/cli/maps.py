@@ -252,9 +252,9 @@ def amend(
     from engram.errors import InputError
     from engram.graph.model import Amendable
     from engram.robot.inspecting import amend_session
-    from engram.sequences.options import parse_start
+    from engram.sequences.options import parse_time
 
-    start_ns = parse_start(recorded_at)
+    start_ns = parse_time("--recorded-at", recorded_at)
     given = {
         Amendable.ROBOT: robot,
         Amendable.START: None if start_ns is None else str(start_ns),

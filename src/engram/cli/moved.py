@@ -17,7 +17,8 @@ VERBS = {
 }
 
 _RANKING = {"--policy": "--ranking"}
-_DRIVE = {"--start": "--recorded-at"}
+_DRIVE = {"--start": "--recorded-at", "--fov": "--field-of-view"}
+_FEATURES = {"--descriptor": "--features"}
 _MERGE = {
     "--policy": "--set merge.ranking=NAME",
     "--lanes": "--set merge.lanes=N",
@@ -26,9 +27,14 @@ _MERGE = {
     "--sure-inliers": "--set merge.sure_inliers=N",
 }
 OPTIONS = {
-    "map": {**_RANKING, **_DRIVE},
+    "doctor": _DRIVE,
+    "drive info": _DRIVE,
+    "drive calibration": _DRIVE,
+    "map": {**_RANKING, **_DRIVE, **_FEATURES},
     "localise": {**_RANKING, **_DRIVE, "--frame": "--explain", "--top": "--explain … --json"},
-    "record": _DRIVE,
+    "record": {**_DRIVE, **_FEATURES},
+    "view": {**_DRIVE, "--save": "--view"},
+    "agent enrol": {"--name": "--robot"},
     "merge": _MERGE,
     "build": {
         **_MERGE,
@@ -39,6 +45,7 @@ OPTIONS = {
     },
     "download": {
         "--policy": "--select",
+        "--region": "--near",
         "--start": "--depart",
         "--end": "--arrive",
         "--window": "--set download.window_min=MINUTES",

@@ -71,11 +71,10 @@ Relocaliser: TypeAlias = Annotated[
         help="How a lost robot is found: fabmap, signature (net), bag-of-words, exhaustive, none",
     ),
 ]
-Descriptor: TypeAlias = Annotated[
+Features: TypeAlias = Annotated[
     str | None,
     typer.Option(
         "--features",
-        "--descriptor",
         metavar="KIND",
         help="Features of a new map or log; engram features list [default: brief].",
     ),
@@ -165,10 +164,10 @@ class Drive:
         Path | None,
         typer.Option("--calibration", metavar="FILE", help="TOML, Kalibr, ROS or OpenCV file."),
     ] = None
-    fov: Annotated[
+    field_of_view: Annotated[
         float | None,
         typer.Option(
-            "--fov",
+            "--field-of-view",
             metavar="DEG",
             help="Field of view of the rectified images [default: the widest].",
             hidden=True,
@@ -204,16 +203,40 @@ class Drive:
     ] = None
 
     def open(self, path: Path) -> OpenDrive:
-        """The drive; see `engram.sequences.open_sequence` for the errors."""
-        from engram.robot import open_drive
+        """The drive; see `engram.open_drive` for the errors."""
+        from engram.sequences.opening import open_with
 
-        return open_drive(path, format=self.format, **self.given())
+        return open_with(path, self.options(), self.format)
 
     def options(self) -> OpenOptions:
-        """How it is opened; see `engram.sequences.options.OpenOptions` for the errors."""
-        from engram.sequences.opening import options_of
+        """How it is opened; see `OpenOptions` for the errors."""
+        from engram.sequences.options import (
+            Channel,
+            FrameRange,
+            OpenOptions,
+            Rig,
+            TimeRange,
+            parse_choice,
+            parse_time,
+        )
 
-        return options_of(**self.given())
+        return OpenOptions(
+            rig=parse_choice(Rig, self.rig),
+            channel=parse_choice(Channel, self.channel),
+            frames=FrameRange() if self.frames is None else FrameRange.parse(self.frames),
+            times=TimeRange.parse(self.from_, self.to),
+            skip_bad=self.skip_bad,
+            robot=self.robot,
+            recorded_at_ns=parse_time("--recorded-at", self.recorded_at),
+            longitude_deg=self.longitude,
+            zone=self.zone,
+            calibration=self.calibration,
+            field_of_view_deg=self.field_of_view,
+            mask=self.mask,
+            left=self.left,
+            right=self.right,
+            motion=tuple(self.motion or ()),
+        )
 
     def typed(self, *besides: str) -> list[str]:
         """The options that were given, as words of a command.
@@ -232,28 +255,6 @@ class Drive:
                 several = value if isinstance(value, list) else [value]
                 words += [word for each in several for word in (option, str(each))]
         return words
-
-    def given(self) -> dict[str, Any]:
-        """Arguments of `engram.sequences.open_sequence` but for path and format."""
-        from engram.sequences import TimeRange
-
-        return {
-            "rig": self.rig,
-            "channel": self.channel,
-            "frames": self.frames,
-            "skip_bad": self.skip_bad,
-            "robot": self.robot,
-            "start": self.recorded_at,
-            "longitude_deg": self.longitude,
-            "zone": self.zone,
-            "times": TimeRange.parse(self.from_, self.to),
-            "calibration": self.calibration,
-            "field_of_view_deg": self.fov,
-            "mask": self.mask,
-            "left": self.left,
-            "right": self.right,
-            "motion": self.motion or (),
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,10 +286,10 @@ class Effort:
     ] = None
 
     def over(self, settings: AllSettings) -> dict[str, Any]:
-        """Policy, lanes, rounds and threads: as given, else as in the settings."""
+        """Ranking, lanes, rounds and threads: as given, else as in the settings."""
         drive = settings.drive
         return {
-            "policy": self.ranking or drive.ranking,
+            "ranking": self.ranking or drive.ranking,
             "lanes": self.lanes or drive.lanes,
             "rounds": self.rounds or drive.rounds,
             "threads": drive.threads,

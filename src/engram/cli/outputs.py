@@ -81,12 +81,11 @@ WrittenFleetMap: TypeAlias = Annotated[
         parser=output_fleet_map,
     ),
 ]
-View: TypeAlias = Annotated[
-    Path | None,
-    typer.Option(
-        "--view",
-        metavar="window|FILE.rrd",
-        help="Watch it in Rerun, or write a recording.",
-        parser=output_recording,
-    ),
-]
+_VIEW = typer.Option(
+    "--view",
+    metavar="window|FILE.rrd",
+    help="Watch it in Rerun, or write a recording.",
+    parser=output_recording,
+)
+View: TypeAlias = Annotated[Path | None, _VIEW]
+Viewed: TypeAlias = Annotated[Path, _VIEW]

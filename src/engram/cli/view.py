@@ -17,15 +17,7 @@ def view(
         Path | None, typer.Argument(metavar="DRIVE", help="A drive to localise in the map.")
     ] = None,
     *,
-    save: Annotated[
-        Path | None,
-        typer.Option(
-            "--save",
-            metavar="FILE.rrd",
-            help="Write a recording instead of opening a window.",
-            parser=outputs.output_file,
-        ),
-    ] = None,
+    view: outputs.Viewed = Path("window"),
     at: options.At = None,
     drive: options.Drive,
     settings: options.SettingsGiven,
@@ -40,13 +32,13 @@ def view(
     Examples:
       engram view town.engram
       engram view town.engram drives/tuesday
-      engram view town.engram drives/tuesday --save tuesday.rrd
+      engram view town.engram drives/tuesday --view tuesday.rrd
     """
     from engram.cli.progress import Bars
     from engram.robot import open_map, robot_on
-    from engram.viewing.viewer import Viewer
+    from engram.viewing.viewer import WINDOW, viewer_on
 
-    with open_map(map_path, at) as opened, Viewer(save) as viewer:
+    with open_map(map_path, at) as opened, viewer_on(view) as viewer:
         if path is None:
             viewer.show(opened)
         else:
@@ -60,6 +52,6 @@ def view(
                 for _ in robot.drive(sequence, monitor):
                     pass
         unfit = () if path is None else robot.unfit
-    if save is not None:
-        typer.echo(f"wrote {save}; open it with: rerun {save}")
+    if view != WINDOW:
+        typer.echo(f"wrote {view}; open it with: rerun {view}")
     untrusted_if(unfit)

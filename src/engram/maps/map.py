@@ -16,6 +16,7 @@ from sqlalchemy import insert
 from engram.errors import InputError, RevisionError
 from engram.geometry import StereoCamera
 from engram.graph.model import Amendable, NodeId, SessionId
+from engram.keywords import keywords
 from engram.maps.amending import checked_amendments
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES
 from engram.maps.hiding import Reverted, compare, hide_revision
@@ -102,6 +103,7 @@ class Map(MapWriter):
             SqliteDatabase(map_path(location)), at=at, writes=writes, cache_bytes=cache_bytes
         )
 
+    @keywords(policy="ranking", map="maps")
     def robot(
         self,
         camera: StereoCamera,
@@ -110,7 +112,7 @@ class Map(MapWriter):
         name: str | None = None,
         maps: bool = False,
         remembers: bool = False,
-        policy: str = "recall",
+        ranking: str = "recall",
         lanes: int = 2,
         rounds: int = 2,
         relocaliser: str | None = "fabmap",
@@ -122,7 +124,7 @@ class Map(MapWriter):
         as a revision. It sees its own nodes at once; maps opened after the commit show them.
 
         Args:
-            camera: its rectified stereo camera.
+            camera: its rectified stereo camera; it may differ from those of the map.
             settings: the configuration; None for the defaults.
             name: name of the robot; required if its drives are stored.
             maps: whether it saves frames that it does not localise, on a separate thread with
@@ -131,14 +133,20 @@ class Map(MapWriter):
             remembers: whether to store its path and match attempts, by which later drives rank;
                 implied by `maps`. They are kept in a file beside the map until the drive ends and
                 no other process writes to the map.
-            policy: key of `POLICIES`.
-            lanes: attempts in parallel (Np).
-            rounds: rounds of attempts per frame (Nr).
-            relocaliser: key of `RELOCALISERS`, for lost robots; None for none.
+            ranking: which nodes to try first: "recall", "path", "distance", …; key of
+                `engram.ranking.POLICIES`.
+            lanes: attempts in parallel (Np), >= 1.
+            rounds: rounds of attempts per frame (Nr), >= 1; up to 32 when lost.
+            relocaliser: how a lost robot is found: "fabmap", "signature" (net), "bag-of-words",
+                "exhaustive"; None for none.
             threads: most threads of the robot, the caller's included; None: `lanes` + 2 to 4.
 
         Raises:
-            InputError: an option is unknown or out of range, or the threads are too few.
+            ConfigError: a keyword or the ranking is unknown, a number is out of range, the name
+                is missing or not valid, or the threads are too few.
+            InputError: the camera is not a `StereoCamera`.
+            MapLockedError: it maps, and another process writes to the map.
+            RevisionError: it stores its drive, and the map is open at an older revision.
             MapError: the map is closed.
         """
         from engram.robot.live import Owner
@@ -146,7 +154,7 @@ class Map(MapWriter):
         from engram.robot.starting import robot_in
 
         self._database.check_open()
-        asked = RobotOptions(policy, lanes, rounds, relocaliser=relocaliser, threads=threads)
+        asked = RobotOptions(ranking, lanes, rounds, relocaliser=relocaliser, threads=threads)
         owner = Owner(name, camera, settings or Settings(), asked)
         return robot_in(self, owner, maps=maps, remembers=remembers)
 

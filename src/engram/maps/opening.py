@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from engram.keywords import keywords
 from engram.maps.map import Map
 from engram.maps.sqlite import map_path
 
 
+@keywords()
 def open_map(path: Path | str, at: int | str | None = None, create: bool = False) -> Map:
     """Opens a map for localising, writing or reading.
 
@@ -16,12 +18,17 @@ def open_map(path: Path | str, at: int | str | None = None, create: bool = False
 
     Args:
         path: NAME.engram.
-        at: number or tag of a revision, to see the map as it was then; None for the newest.
+        at: number or name of a revision (7, a tag, "head~2"), to see the map as it was then; None
+            for the newest.
         create: create an empty map if the file does not exist and no revision is named.
 
     Raises:
-        MapError: the file is not a map, of a newer format, or damaged.
+        NotAMapError: the file does not exist, or is not a map.
+        FormatVersionError: a newer Engram wrote it.
+        MapCorruptError: it is too damaged to read.
         RevisionError: there is no such revision.
+        InputError: a map is to be created, and its folder does not exist.
+        ConfigError: a keyword is unknown.
     """
     if create and at is None and not map_path(path).exists():
         Map.create(path).close()

@@ -34,8 +34,7 @@ class RecentConfig:
         int,
         Meta(
             ge=0,
-            description="iterations remembered; 5 to 200 are nearly alike. "
-            "Source: [L15] Fig. 13",
+            description="iterations remembered; 5 to 200 are nearly alike. Source: [L15] Fig. 13",
         ),
     ] = 10
     T_unit: Annotated[

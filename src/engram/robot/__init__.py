@@ -9,9 +9,10 @@ from engram.robot.recorder import Recorder, RecorderConfig
 from engram.robot.recording import ExtractReport, extract_log
 from engram.robot.results import localise_drive, measure, measured, summarise
 from engram.robot.robot import Robot
-from engram.robot.session import DriveSequence, open_drive, session_of_drive
+from engram.robot.session import DriveSequence, session_of_drive
 from engram.robot.settings import RobotOptions, Settings, load_settings
 from engram.robot.starting import robot_on
+from engram.sequences import open_drive
 
 __all__ = [
     "Beginning",

@@ -12,7 +12,7 @@ from engram.calibration.entries import MAX_CHARACTERS, read_yaml
 from engram.errors import ConfigError, InputError
 from engram.maps.map_frame import FARTHEST_M
 from engram.sequences.images import image_size
-from engram.sequences.options import parse_start
+from engram.sequences.options import parse_time
 from engram.untrusted import read_text
 
 # Farthest in time from a node that a line with a time may be.
@@ -149,7 +149,7 @@ def _time_ns(text: str, line: int, source: Path) -> int:
     except (ValueError, OverflowError):
         pass
     try:
-        found = parse_start(text)
+        found = parse_time("stamp", text)
     except ConfigError as error:
         raise InputError(f"{source}, line {line}: {error}") from error
     assert found is not None

@@ -37,21 +37,21 @@ class ExplainOptions:
 
     Attributes:
         frame: number of the frame in the drive, from 0.
-        policy: key of `POLICIES`.
+        ranking: which nodes to try first: key of `POLICIES`.
         lanes, rounds: the budget of each frame up to and including this one.
         relocaliser: key of `RELOCALISERS`; None for none.
         at: number or tag of the map's revision; None for the newest.
     """
 
     frame: int
-    policy: str = "recall"
+    ranking: str = "recall"
     lanes: int = 2
     rounds: int = 2
     relocaliser: str | None = "fabmap"
     at: int | str | None = None
 
     def __post_init__(self) -> None:
-        check_for_robot(self.policy)
+        check_for_robot(self.ranking)
         if self.frame < 0:
             raise ConfigError(f"frame is {self.frame}, must be 0 or more")
 
@@ -118,7 +118,7 @@ class Explanation:
     Attributes:
         frame: number of the frame.
         stamp_ns: its stamp, UTC.
-        policy: name of the ranking policy.
+        ranking: name of the ranking policy.
         status: localisation status of the frame.
         meaning: description of each term, one line each.
         rule: how the terms give the order; empty if the policy's name says it.
@@ -127,7 +127,7 @@ class Explanation:
 
     frame: int
     stamp_ns: int
-    policy: str
+    ranking: str
     status: LocalisationStatus
     meaning: dict[str, str] = field(default_factory=dict)
     rule: str = ""
@@ -138,7 +138,7 @@ class Explanation:
         return {
             "frame": self.frame,
             "stamp_ns": self.stamp_ns,
-            "policy": self.policy,
+            "ranking": self.ranking,
             "status": self.status.value,
             "meaning": self.meaning,
             "rule": self.rule,
@@ -175,16 +175,16 @@ def explain_frame(
         map_path: NAME.engram.
         sequence: the drive.
         settings: the resolved configuration.
-        options: frame, policy and budget.
+        options: frame, ranking and budget.
 
     Raises:
         ConfigError: the drive has no such frame, or the policy is unknown.
         MapError: the map cannot be read.
         SequenceError: the drive's images cannot be used.
     """
-    watching = _Watching(policy_named(options.policy))
+    watching = _Watching(policy_named(options.ranking))
     asked = RobotOptions(
-        options.policy, options.lanes, options.rounds, relocaliser=options.relocaliser
+        options.ranking, options.lanes, options.rounds, relocaliser=options.relocaliser
     )
     with (
         open_map(map_path, options.at) as opened,
@@ -209,7 +209,7 @@ def _explained(
     attempted: set[int],
 ) -> Explanation:
     if watching.asked is None:
-        return Explanation(options.frame, found.stamp_ns, options.policy, found.status)
+        return Explanation(options.frame, found.stamp_ns, options.ranking, found.status)
     context, order, reasons, foreseen = watching.asked
     near, rates = context.neighbourhood, context.success_rates()
     drives = _drives(opened)
@@ -237,7 +237,7 @@ def _explained(
     return Explanation(
         options.frame,
         found.stamp_ns,
-        options.policy,
+        options.ranking,
         found.status,
         reasons.meaning,
         reasons.rule,

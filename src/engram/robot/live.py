@@ -76,7 +76,7 @@ class Owner:
             opened,
             self.camera,
             self.settings,
-            policy=self.options.policy,
+            policy=self.options.ranking,
             budget=self.options.budget,
             relocaliser=self.finder or self.options.relocaliser,
             saves=saves,

@@ -13,6 +13,7 @@ from engram.errors import ConfigError
 from engram.files import check_parent
 from engram.frontend import DescriptorKind, Frontend, feature_kind
 from engram.graph.model import Session
+from engram.keywords import keywords
 from engram.localiser import Localisation, Localiser
 from engram.maps import Map, RevisionWriter, SessionState, open_map
 from engram.monitor import QUIET, Monitor
@@ -92,6 +93,7 @@ class Beginning:
     resumed: bool
 
 
+@keywords(descriptor="features")
 def map_drive(
     map_path: Path | str,
     sequence: DriveSequence,
@@ -99,7 +101,7 @@ def map_drive(
     options: RobotOptions | None = None,
     monitor: Monitor = QUIET,
     begin: Callable[[Beginning], None] | None = None,
-    descriptor: str | None = None,
+    features: str | None = None,
 ) -> MapReport:
     """Adds a drive to a map; creates the map if there is none.
 
@@ -113,12 +115,12 @@ def map_drive(
         options: how to map it; None for the defaults.
         monitor: receives the status of each frame, and may stop the drive.
         begin: called before the first frame, to tell the robot its place or to watch it.
-        descriptor: required kind of descriptor; None for that of the frame log, the map or the
-            settings, whichever is known first.
+        features: required kind of features: "brief", "net", "teblid"; None for that of the frame
+            log, the map or the settings, whichever is known first.
 
     Raises:
-        ConfigError: the frame log or the map has another kind of descriptor than required, or the
-            threads are too few.
+        ConfigError: a keyword is unknown, the frame log or the map has another kind of features
+            than required, or the threads are too few.
         InputError: the sequence is a path or a list, not a drive.
         MapError: the map cannot be read or written; what was checkpointed is intact.
         SequenceError: the drive's images cannot be used; the earlier frames are saved.
@@ -127,9 +129,9 @@ def map_drive(
     """
     map_path = Path(map_path)
     settings, options = settings or Settings(), options or RobotOptions()
-    if descriptor is not None and isinstance(sequence, FrameLog):
-        mend = f"record it again with --features {descriptor}"
-        _check_descriptor(descriptor, sequence.header.descriptor, str(sequence.path), mend)
+    if features is not None and isinstance(sequence, FrameLog):
+        mend = f"record it again with --features {features}"
+        _check_features(features, sequence.header.descriptor, str(sequence.path), mend)
     options.lane_threads(maps=True)  # refuses too few threads before anything is written
     session = session_of_drive(sequence)
     report = MapReport(session)
@@ -138,9 +140,9 @@ def map_drive(
     # A new map is made once the drive's first frames are read: nothing stays if they cannot be.
     with _written(map_path) if map_path.exists() else nullcontext() as opened:
         if opened is not None:
-            if descriptor is not None:
+            if features is not None:
                 mend = "map the drive into another map"
-                _check_descriptor(descriptor, opened.descriptor, str(map_path), mend)
+                _check_features(features, opened.descriptor, str(map_path), mend)
             if opened.session_state(session.id) is SessionState.COMMITTED:
                 report.known = True
                 return report
@@ -160,8 +162,8 @@ def _written(map_path: Path) -> Iterator[Map]:
         yield opened
 
 
-def _check_descriptor(asked: str, found: DescriptorKind | None, what: str, mend: str) -> None:
-    """Refuses a required kind of descriptor that differs from the existing one.
+def _check_features(asked: str, found: DescriptorKind | None, what: str, mend: str) -> None:
+    """Refuses a required kind of features that differs from the existing one.
 
     Raises:
         ConfigError: they differ.
@@ -240,7 +242,7 @@ class _Mapping:
             opened,
             self.sequence.camera,
             self.settings,
-            policy=self.options.policy,
+            policy=self.options.ranking,
             budget=self.options.budget,
             relocaliser=relocaliser_with_fixes(
                 opened, self.sequence, self.settings, self.options.relocaliser

@@ -1,37 +1,14 @@
-"""From a path to a drive and its session."""
+"""From a drive to its session."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from engram.errors import InputError, SequenceError
 from engram.graph.model import Session
-from engram.sequences import (
-    Drive,
-    FrameLog,
-    StereoSequence,
-    first_pair_hash,
-    open_sequence,
-    session_of,
-)
+from engram.sequences import FrameLog, StereoSequence, first_pair_hash, session_of
 
 DriveSequence: TypeAlias = StereoSequence | FrameLog
-
-
-def open_drive(path: Path | str, **options: Any) -> Drive:
-    """Opens a drive.
-
-    Args:
-        path: a folder of stereo images, a bag, or a frame log.
-        **options: options of `open_sequence`.
-
-    Raises:
-        SequenceError: the drive cannot be used.
-        CalibrationError: its calibration cannot be used.
-        ConfigError: an option is out of range.
-    """
-    return open_sequence(path, **options)
 
 
 def session_of_drive(sequence: DriveSequence) -> Session:

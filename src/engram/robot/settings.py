@@ -73,7 +73,7 @@ class RobotOptions:
     """Ranking policy and budget of a robot.
 
     Attributes:
-        policy: key of `POLICIES`.
+        ranking: which nodes to try first: key of `POLICIES`.
         lanes, rounds: the budget of each frame.
         deadline_ms: latest start of an attempt after its frame arrived. With None only the counts
             limit it, so that equal input gives equal results.
@@ -84,7 +84,7 @@ class RobotOptions:
         force: whether a drive with a fatal finding of the doctor is mapped all the same.
     """
 
-    policy: str = "recall"
+    ranking: str = "recall"
     lanes: int = 2
     rounds: int = 2
     deadline_ms: float | None = None
@@ -94,7 +94,7 @@ class RobotOptions:
     force: bool = False
 
     def __post_init__(self) -> None:
-        check_for_robot(self.policy)
+        check_for_robot(self.ranking)
         Budget(self.lanes, self.rounds, deadline_ms=self.deadline_ms)  # checks the values
         if self.threads is not None and (type(self.threads) is not int or self.threads < 1):
             raise ConfigError(f"threads is {self.threads}, must be a number of at least 1, or None")

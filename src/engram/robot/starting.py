@@ -56,7 +56,7 @@ def robot_on(
         opened,
         sequence.camera,
         settings,
-        policy=policy or options.policy,
+        policy=policy or options.ranking,
         budget=options.budget,
         relocaliser=finder,
         live=session.id,

@@ -28,9 +28,9 @@ from engram.places import (
 )
 from engram.places.words import NodeWords, vocabulary_or_default
 from engram.robot.front import arriving
-from engram.robot.session import DriveSequence, open_drive
+from engram.robot.session import DriveSequence
 from engram.robot.settings import Settings
-from engram.sequences import LoggedFrame
+from engram.sequences import LoggedFrame, open_drive
 
 MAP_SUFFIX = ".engram"
 

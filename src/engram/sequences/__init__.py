@@ -9,11 +9,11 @@ from engram.sequences.opening import (
     SequenceFormat,
     layout_named,
     layout_names,
+    open_drive,
     open_images,
-    open_sequence,
     stamps_of,
 )
-from engram.sequences.options import FrameRange, OpenOptions, TimeRange
+from engram.sequences.options import FrameRange, OpenOptions
 from engram.sequences.sequence import (
     FrameSequence,
     LoggedFrame,
@@ -40,13 +40,12 @@ __all__ = [
     "SequenceFormat",
     "SequenceInfo",
     "StereoSequence",
-    "TimeRange",
     "check_name",
     "first_pair_hash",
     "layout_named",
     "layout_names",
+    "open_drive",
     "open_images",
-    "open_sequence",
     "session_of",
     "stamps_of",
 ]

@@ -192,5 +192,6 @@ def check_no_view(options: OpenOptions, cameras: Cameras) -> None:
     """
     if options.field_of_view_deg is not None and cameras.rectification is None:
         raise CalibrationError(
-            "the images are rectified already: --fov is for raw images and their calibration"
+            "the images are rectified already: --field-of-view is for raw images "
+            "and their calibration"
         )

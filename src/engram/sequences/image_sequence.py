@@ -78,8 +78,8 @@ class ImageSequence:
         self._options = options
         places = drive.places
         self._shift_ns = 0
-        if options.start_ns is not None:
-            places, self._shift_ns = _shifted(places, options.start_ns)
+        if options.recorded_at_ns is not None:
+            places, self._shift_ns = _shifted(places, options.recorded_at_ns)
         self.motion()  # so that a file that cannot be used is known at once
         self._pairs, self._listing_faults = usable_pairs(
             places, options.skip_bad, drive.path, partial(_chosen, options)
@@ -245,7 +245,7 @@ def with_options(info: SequenceInfo, options: OpenOptions) -> SequenceInfo:
         ConfigError: a start time is given for a drive whose clock is UTC already.
     """
     clock = info.clock
-    if options.start_ns is not None:
+    if options.recorded_at_ns is not None:
         if clock is Clock.UTC:
             raise ConfigError(
                 f"{info.name}: its stamps are UTC already; a start time is for drives whose clock "

@@ -1,4 +1,4 @@
-"""Opens a drive of any layout: the table of known layouts and `open_sequence`.
+"""Opens a drive of any layout: the table of known layouts and `open_drive`.
 
 Other packages add layouts by entry points of the group `engram.readers` that name a
 `SequenceFormat`.
@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from shlex import quote
 from types import MappingProxyType
-from typing import Any, TypeAlias, TypedDict, Unpack
+from typing import TypeAlias
 
 from engram.errors import ConfigError, SequenceError
+from engram.keywords import keywords
 from engram.plugins import PluginGroup, check_is
 from engram.sequences.bags import BagSequence, is_bag, open_bag
 from engram.sequences.clocks import StampReport
@@ -31,13 +31,15 @@ from engram.sequences.kitti import (
     is_kitti_raw,
 )
 from engram.sequences.options import (
+    PAIR_TOLERANCE_NS,
     Channel,
     FrameRange,
+    Moment,
     OpenOptions,
     Rig,
     TimeRange,
     parse_choice,
-    parse_start,
+    parse_time,
 )
 from engram.sequences.robotcar import find_robotcar, is_robotcar
 
@@ -140,11 +142,28 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
 )
 
 
-def open_sequence(
+@keywords(start="recorded_at")
+def open_drive(
     path: str | Path,
     *,
     format: str | None = None,  # noqa: A002, the word of the command line
-    **given: Unpack[OpenArguments],
+    rig: Rig | str = Rig.GREY,
+    channel: Channel | str = Channel.GREY,
+    frames: FrameRange | str | None = None,
+    from_: Moment | None = None,
+    to: Moment | None = None,
+    skip_bad: bool = False,
+    pair_tolerance_ns: int = PAIR_TOLERANCE_NS,
+    robot: str | None = None,
+    recorded_at: str | datetime | int | None = None,
+    longitude_deg: float | None = None,
+    zone: str | None = None,
+    calibration: str | Path | None = None,
+    field_of_view_deg: float | None = None,
+    mask: str | Path | None = None,
+    left: str | None = None,
+    right: str | None = None,
+    motion: Sequence[str | Path] = (),
 ) -> Drive:
     """Opens a drive of any known layout. Folders are checked for all images; none is decoded.
 
@@ -152,21 +171,69 @@ def open_sequence(
     logs a `FrameLog` (a `FrameSequence`).
 
     Args:
-        path: folder or file of the drive.
+        path: folder or file of the drive: stereo images, a ROS bag, or a frame log.
         format: one of `layout_names()`; None recognises the layout by its files.
-        **given: see `OpenArguments`.
+        rig: "grey" or "colour" (or "color"), if the robot has both (KITTI).
+        channel: "grey", or one channel of colour images: "red", "green", "blue".
+        frames: which frames are used, as text START:STOP:STEP or `FrameRange`, counted from 0;
+            None for all.
+        from_, to: stretch of the drive that is used, both ends included: seconds from its first
+            frame (12.5), or a time as in `recorded_at`; None for the drive's own ends.
+        skip_bad: leave out bad pairs and count them (`skipped`), instead of failing.
+        pair_tolerance_ns: largest difference of stamps within a pair, ns, for layouts that pair
+            by stamp.
+        robot: name of the robot; None for that of the source.
+        recorded_at: time of the drive's first frame, for a drive whose clock is relative or
+            unknown: ISO 8601 (UTC unless it has an offset), a `datetime`, or ns since 1970 (int).
+        longitude_deg: longitude of the drive, degrees east; None for that of the source.
+        zone: IANA time zone of the drive, "Europe/London"; None for that of the source.
+        calibration: file of the pair's calibration, see `engram.calibration`; None for the drive's
+            own.
+        field_of_view_deg: horizontal field of view of the rectified images, degrees, 10 to 170;
+            None for the largest.
+        mask: image that is black where the robot sees itself, of the size of the drive's images.
+        left, right: topics of a bag's images; None finds them by their names.
+        motion: topics of a bag, or files, with odometry or a gyroscope's rates.
 
     Raises:
         SequenceError: the path does not exist, has no known layout, or its images or stamps
             cannot be used; the message names file and fault.
         CalibrationError: its calibration is missing, malformed, or does not fit.
-        ConfigError: an argument is out of range or does not fit the layout.
+        ConfigError: a keyword is unknown, out of range, or does not fit the layout.
         MapError: a frame log is damaged, locked, or of a newer format.
         MissingExtraError: it is a bag, and the extra `bags` is not installed.
         IncompatibleError: another package adds a layout, and it cannot be used.
     """
-    path, options = Path(path), options_of(**given)
-    name = recognise(path) if format is None else format
+    options = OpenOptions(
+        rig=parse_choice(Rig, rig),
+        channel=parse_choice(Channel, channel),
+        frames=FrameRange.parse(frames) if isinstance(frames, str) else frames or FrameRange(),
+        times=TimeRange.parse(from_, to),
+        skip_bad=skip_bad,
+        pair_tolerance_ns=pair_tolerance_ns,
+        robot=robot,
+        recorded_at_ns=parse_time("recorded_at", recorded_at),
+        longitude_deg=longitude_deg,
+        zone=zone,
+        calibration=None if calibration is None else Path(calibration),
+        field_of_view_deg=field_of_view_deg,
+        mask=None if mask is None else Path(mask),
+        left=left,
+        right=right,
+        motion=tuple(map(str, motion)),
+    )
+    return open_with(Path(path), options, format)
+
+
+def open_with(path: Path, options: OpenOptions, name: str | None = None) -> Drive:
+    """Opens a drive by checked options; see `open_drive` for the errors.
+
+    Args:
+        path: folder or file of the drive.
+        options: how it is opened.
+        name: one of `layout_names()`; None recognises the layout by its files.
+    """
+    name = recognise(path) if name is None else name
     layout = layout_named(name)
     if options.rig not in layout.rigs:
         raise ConfigError(
@@ -204,78 +271,6 @@ _PLUGINS = PluginGroup(
 
 def _layouts() -> dict[str, SequenceFormat]:
     return {name: layout_named(name) for name in layout_names()}
-
-
-class OpenArguments(TypedDict, total=False):
-    """How to open a drive, as plain values; see `OpenOptions` for the defaults.
-
-    Attributes:
-        rig: "grey" or "colour" (or "color"), if the robot has both (KITTI).
-        channel: "grey", or one channel of colour images: "red", "green", "blue".
-        frames: which frames are used, as `FrameRange` or text START:STOP:STEP.
-        skip_bad: leave out bad pairs and count them (`skipped`), instead of failing.
-        pair_tolerance_ns: largest difference of stamps within a pair, ns, for layouts that pair
-            by stamp.
-        robot: name of the robot; None for that of the source.
-        start: absolute time of the drive's first frame (ISO 8601, UTC unless it has an offset, or
-            ns since 1970), for a drive whose clock is relative or unknown.
-        longitude_deg: longitude of the drive, degrees east.
-        zone: IANA time zone of the drive.
-        times: which stretch of the drive is used; None for all.
-        calibration: file of the pair's calibration, see `engram.calibration`; None for the drive's
-            own.
-        field_of_view_deg: horizontal field of view of rectified images; None for the largest.
-        mask: image that is black where the robot sees itself, of the size of the drive's images.
-        left, right: topics of a bag's images; None finds them by their names.
-        motion: topics of a bag, or files, with odometry or a gyroscope's rates.
-    """
-
-    rig: Rig | str
-    channel: Channel | str
-    frames: FrameRange | str | None
-    skip_bad: bool
-    pair_tolerance_ns: int
-    robot: str | None
-    start: str | datetime | int | None
-    longitude_deg: float | None
-    zone: str | None
-    times: TimeRange | None
-    calibration: str | Path | None
-    field_of_view_deg: float | None
-    mask: str | Path | None
-    left: str | None
-    right: str | None
-    motion: Sequence[str]
-
-
-def options_of(**given: Unpack[OpenArguments]) -> OpenOptions:
-    """The options of `open_sequence`, from plain values.
-
-    Raises:
-        ConfigError: an argument is out of range.
-    """
-    values: dict[str, Any] = {
-        name: _PARSERS[name](value) if name in _PARSERS and value is not None else value
-        for name, value in given.items()
-    }
-    for absent in [name for name in ("frames", "times") if values.get(name, "") is None]:
-        del values[absent]
-    if "start" in values:
-        values["start_ns"] = values.pop("start")
-    return OpenOptions(**values)
-
-
-_PARSERS: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
-    {
-        "rig": partial(parse_choice, Rig),
-        "channel": partial(parse_choice, Channel),
-        "frames": lambda given: FrameRange.parse(given) if isinstance(given, str) else given,
-        "start": parse_start,
-        "calibration": Path,
-        "mask": Path,
-        "motion": tuple,
-    }
-)
 
 
 def recognise(path: Path) -> str:

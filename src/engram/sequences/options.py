@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, TypeAlias, TypeVar
 
 from msgspec import Meta
 
@@ -19,6 +19,10 @@ from engram.sequences.sequence import check_name
 
 T = TypeVar("T")
 E = TypeVar("E", bound=StrEnum)
+
+Moment: TypeAlias = str | float | int | datetime
+"""A moment of a drive: seconds from its first frame (float, or such text), or a time: ISO 8601,
+`datetime`, or ns since 1970 (int)."""
 
 _PART = re.compile(r"[0-9]{1,9}")
 _SECONDS = re.compile(r"[0-9]{1,9}(\.[0-9]{0,9})?")
@@ -128,8 +132,8 @@ class TimeRange:
             raise ConfigError(f"--from {start} is after --to {stop}: no frame lies between")
 
     @staticmethod
-    def parse(start: str | None, stop: str | None) -> TimeRange:
-        """Read seconds such as 12.5, or ISO 8601 times such as 2026-03-01T09:30:00Z (UTC).
+    def parse(start: Moment | None, stop: Moment | None) -> TimeRange:
+        """Reads seconds such as 12.5, or times such as 2026-03-01T09:30:00Z (UTC).
 
         Raises:
             ConfigError: a text is neither.
@@ -158,18 +162,22 @@ def _as_ns(moment: float | int, first_ns: int) -> int:
     return moment if isinstance(moment, int) else first_ns + round(moment * 1e9)
 
 
-def _moment(option: str, text: str | None) -> float | int | None:
-    if text is None:
-        return None
-    if _SECONDS.fullmatch(text.strip()):
-        return float(text)
+def _moment(option: str, given: Moment | None) -> float | int | None:
+    if isinstance(given, float):
+        return given
+    if isinstance(given, str) and _SECONDS.fullmatch(given.strip()):
+        return float(given)
     try:
-        return parse_start(text)
+        return parse_time(option, given)
     except ConfigError:
         raise ConfigError(
-            f"{option} {text!r}: write seconds from the drive's start, such as 12.5, or a time "
+            f"{option} {given!r}: write seconds from the drive's start, such as 12.5, or a time "
             "such as 2026-03-01T09:30:00Z"
         ) from None
+
+
+# Software-triggered pairs stay below it, and it is half of the frame interval at 100 Hz.
+PAIR_TOLERANCE_NS = 5_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,11 +190,10 @@ class OpenOptions:
         frames: which frames are used.
         skip_bad: leave out bad pairs and count them, instead of failing.
         pair_tolerance_ns: largest difference of stamps within a pair, ns, for layouts that pair by
-            stamp. Default 5 ms: software-triggered pairs stay below it, and it is half of the
-            frame interval at 100 Hz.
+            stamp.
         robot: name of the robot; None for that of the source.
-        start_ns: absolute time of the drive's first frame, ns since 1970 UTC, for a drive whose
-            clock is not UTC.
+        recorded_at_ns: time of the drive's first frame, ns since 1970 UTC, for a drive whose clock
+            is not UTC.
         longitude_deg, zone: where the drive was; None for the source's value.
         times: which stretch of the drive is used.
         calibration: file of the stereo pair's calibration; None for the drive's own.
@@ -203,9 +210,9 @@ class OpenOptions:
     channel: Channel = Channel.GREY
     frames: FrameRange = field(default_factory=FrameRange)
     skip_bad: bool = False
-    pair_tolerance_ns: Annotated[int, Meta(ge=0)] = 5_000_000
+    pair_tolerance_ns: Annotated[int, Meta(ge=0)] = PAIR_TOLERANCE_NS
     robot: str | None = None
-    start_ns: int | None = None
+    recorded_at_ns: int | None = None
     longitude_deg: float | None = None
     zone: str | None = None
     times: TimeRange = field(default_factory=TimeRange)
@@ -240,27 +247,32 @@ def parse_choice(kind: type[E], text: str) -> E:
         ) from None
 
 
-def parse_start(start: str | datetime | int | None) -> int | None:
-    """A start time as ns since 1970: an ISO 8601 text, a `datetime`, or the ns themselves.
+def parse_time(name: str, given: str | datetime | int | None) -> int | None:
+    """A time as ns since 1970: an ISO 8601 text, a `datetime`, or the ns themselves.
 
     A time without an offset is taken as UTC.
+
+    Args:
+        name: the option or keyword, for the error.
+        given: the time; None gives None.
 
     Raises:
         ConfigError: the text is not an ISO 8601 time, or the time lies before 1970.
     """
-    if start is None:
+    if given is None:
         return None
-    if isinstance(start, str):
+    time = given
+    if isinstance(time, str):
         try:
-            start = datetime.fromisoformat(start)
+            time = datetime.fromisoformat(time)
         except ValueError:
             raise ConfigError(
-                f"start {start!r} is not an ISO 8601 time such as 2011-09-26T13:02:25Z"
+                f"{name} {given!r} is not an ISO 8601 time such as 2011-09-26T13:02:25Z"
             ) from None
-    if isinstance(start, datetime):
-        aware = start if start.tzinfo else start.replace(tzinfo=UTC)
+    if isinstance(time, datetime):
+        aware = time if time.tzinfo else time.replace(tzinfo=UTC)
         # Whole microseconds: `timestamp()` is a float and would lose the last digits.
-        start = (aware - datetime(1970, 1, 1, tzinfo=UTC)) // _MICROSECOND * 1000
-    if not 0 <= start < 2**63:
-        raise ConfigError(f"start is {start} ns since 1970, must be between 1970 and 2262")
-    return start
+        time = (aware - datetime(1970, 1, 1, tzinfo=UTC)) // _MICROSECOND * 1000
+    if not 0 <= time < 2**63:
+        raise ConfigError(f"{name} is {time} ns since 1970, must be between 1970 and 2262")
+    return time

@@ -17,7 +17,9 @@ from engram.geometry import StereoCamera
 from engram.sequences import (
     Drive,
     FrameLog,
+    FrameRange,
     LoggedFrame,
+    OpenOptions,
     SequenceFormat,
     first_pair_hash,
     layout_named,
@@ -25,7 +27,6 @@ from engram.sequences import (
     session_of,
 )
 from engram.sequences.images import IMAGE_SUFFIXES
-from engram.sequences.opening import OpenArguments, options_of
 from engram.testing.checks import Check
 
 # Writes a drive of these pairs below an empty folder and returns the path that users name.
@@ -94,9 +95,9 @@ class _Trial:
         folder.mkdir()
         return self._write(folder, self._pairs)
 
-    def _open(self, path: Path, **options: object) -> Drive:
-        given: OpenArguments = options  # type: ignore[assignment]
-        return self._layout.open(path, options_of(**given))
+    def _open(self, path: Path, frames: str = "0::1", *, skip_bad: bool = False) -> Drive:
+        options = OpenOptions(frames=FrameRange.parse(frames), skip_bad=skip_bad)
+        return self._layout.open(path, options)
 
     def _recognition(self) -> str:
         if not self._layout.recognises(self._drive):
@@ -123,7 +124,7 @@ class _Trial:
         return _not_these(_stamps_of(drive), range(_PAIRS))
 
     def _slice(self) -> str:
-        return _not_these(_stamps_of(self._open(self._drive, frames="1:6:2")), (1, 3, 5), first=1)
+        return _not_these(_stamps_of(self._open(self._drive, "1:6:2")), (1, 3, 5), first=1)
 
     def _images(self) -> str:
         drive = self._open(self._drive)

@@ -31,6 +31,10 @@ _JPEG_QUALITY = 80
 _STRIP = 50
 
 
+# What ``--view`` takes in place of a file.
+WINDOW = Path("window")
+
+
 class Viewer:
     """Shows a map from above by experience, and a robot's frames as they come.
 
@@ -150,9 +154,12 @@ def viewer_for(view: Path | None) -> Viewer | nullcontext[None]:
     Raises:
         InputError: it is neither "window" nor a file NAME.rrd; or as `Viewer`.
     """
-    if view is None:
-        return nullcontext()
-    if view == Path("window"):
+    return nullcontext() if view is None else viewer_on(view)
+
+
+def viewer_on(view: Path) -> Viewer:
+    """The viewer of an option ``--view`` that is given; see `viewer_for`."""
+    if view == WINDOW:
         return Viewer()
     if view.suffix != ".rrd":
         raise InputError(f"--view {view}: give window, or a file to write, NAME.rrd")

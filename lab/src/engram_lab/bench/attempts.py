@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from engram.frontend import Frame, Frontend, MatcherConfig, StereoPair, match_frames
-from engram.sequences.opening import open_sequence
+from engram.sequences.opening import open_drive
 from engram_lab.bench.data import BenchData, scale_and_crop
 
 _OTHER_DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync"
@@ -39,7 +39,7 @@ def _elsewhere(data: BenchData, size: str) -> list[StereoPair]:
     folder = Path(os.environ.get("ENGRAM_DATA", "")) / _OTHER_DRIVE
     if not folder.is_dir():
         return [_mirrored(pair) for pair in data.at(size)]
-    pairs = [pair for pair in open_sequence(folder) if isinstance(pair, StereoPair)]
+    pairs = [pair for pair in open_drive(folder) if isinstance(pair, StereoPair)]
     return [scale_and_crop(pair) for pair in pairs] if size == "512" else pairs
 
 

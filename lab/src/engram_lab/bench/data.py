@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from engram.frontend import StereoPair
 from engram.geometry import StereoCamera
-from engram.sequences.opening import open_sequence
+from engram.sequences.opening import open_drive
 
 _SMALL_WIDTH_PX, _SMALL_HEIGHT_PX = 512, 384
 
@@ -46,7 +46,7 @@ def load_bench_data() -> BenchData:
     if root:
         clip = Path(root) / "kitti_odometry" / "sequences" / "06"
         if clip.is_dir():
-            pairs = [entry for entry in open_sequence(clip) if isinstance(entry, StereoPair)]
+            pairs = [entry for entry in open_drive(clip) if isinstance(entry, StereoPair)]
             return BenchData("KITTI odometry 06", tuple(pairs))
     return BenchData("synthetic street", synthetic_drive())
 

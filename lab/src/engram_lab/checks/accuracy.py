@@ -26,7 +26,7 @@ from engram.frontend import (
 )
 from engram.geometry import SE3
 from engram.odometry import Odometry, OdometryConfig
-from engram.sequences import open_sequence
+from engram.sequences import open_drive
 from engram_lab.programs import Figure, command_line, report
 
 KITTI_06 = "kitti_odometry/sequences/06"
@@ -44,7 +44,7 @@ CAM0_FROM_CAM2_M = np.array([-0.0598, 0.0004, -0.0027])
 
 def frames_of(folder: Path, **options: Any) -> list[Frame]:
     frontend = Frontend(FrontendConfig(thumbnails=False))
-    pairs = open_sequence(folder, **options)
+    pairs = open_drive(folder, **options)
     return [frontend.extract(pair) for pair in pairs if isinstance(pair, StereoPair)]
 
 

@@ -25,7 +25,7 @@ from engram.graph.model import Node
 from engram.localiser import Localisation, LocalisationStatus, Position
 from engram.odometry import OdometryStatus, OdometryStep, OutsideMotion
 from engram.robot import RobotOptions, Settings, map_drive, open_map, robot_on
-from engram.sequences import FrameLog, LoggedFrame, open_sequence
+from engram.sequences import FrameLog, LoggedFrame, open_drive
 from engram.sequences.trajectories import Trajectory
 from engram_lab.truth import read_truth
 from engram_lab.wheels import BIAS_RAD_S, measured
@@ -145,10 +145,10 @@ def main() -> None:
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         map_path = Path(folder) / "town.engram"
-        mapped = open_sequence(asked.mapped)
+        mapped = open_drive(asked.mapped)
         map_drive(map_path, mapped)
         for path in asked.live:
-            log = open_sequence(path)
+            log = open_drive(path)
             assert isinstance(log, FrameLog)
             truths = {"mapped": read_truth(asked.mapped), "live": read_truth(path)}
             assert truths["live"] is not None

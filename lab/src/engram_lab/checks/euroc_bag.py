@@ -27,9 +27,9 @@ from engram.calibration import Cameras
 from engram.geometry import SE3
 from engram.maps import open_map
 from engram.monitor import QUIET
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
+from engram.robot import RobotOptions, Settings, map_drive
 from engram.robot.starting import robot_on
-from engram.sequences import open_sequence
+from engram.sequences import open_drive
 from engram.sequences.image_sequence import ImageSequence
 from engram_lab.checks.accuracy import NEAR_M, error_of, frames_of, match
 
@@ -106,7 +106,7 @@ def camchain(cameras: Cameras) -> str:
 
 
 def _cameras(folder: Path) -> Cameras:
-    drive = open_sequence(folder)
+    drive = open_drive(folder)
     assert isinstance(drive, ImageSequence)
     return drive.cameras
 

@@ -58,7 +58,7 @@ def handed_in(centre: Path, log: Path, folder: Path) -> Path:
 
 def tried(centre: Path, log: Path, policy: str, lanes: int, settings: Settings) -> Array:
     """(2,): share of a drive's route that is missed, mean distance of the first attempts, m."""
-    options = RobotOptions(policy=policy, lanes=lanes, rounds=1)
+    options = RobotOptions(ranking=policy, lanes=lanes, rounds=1)
     found, first_m = [], []
     sequence = open_drive(log)
     with Map.open(centre) as opened, robot_on(opened, sequence, settings, options) as robot:

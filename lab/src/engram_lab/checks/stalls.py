@@ -145,15 +145,15 @@ def figures(data: Path, *, fine: bool) -> Iterator[Figure]:
     truth = [SE3.from_matrix(row.reshape(3, 4)) for row in rows]
     with tempfile.TemporaryDirectory(prefix="engram-stalls-") as folder:
         for number, (name, frames) in enumerate(MAPS.items()):
-            mapped = _images(data, **({} if frames is None else {"frames": frames}))
+            mapped = _images(data, frames)
             clip = Clip(pairs, truth, Path(folder) / f"{number}.engram", mapped)
             yield from _rows(f"stalls, map of {name}", stalls(clip, gaps_of(len(pairs), fine=fine)))
             yield from _rows(f"freezes, map of {name}", freezes(clip, (10, 20, 30)))
             clip.close()
 
 
-def _images(data: Path, **options: str) -> ImageSequence:
-    drive = engram.open_drive(data / KITTI_06, **options)
+def _images(data: Path, frames: str | None = None) -> ImageSequence:
+    drive = engram.open_drive(data / KITTI_06, frames=frames)
     assert isinstance(drive, ImageSequence)
     return drive
 

@@ -114,7 +114,7 @@ def _localise(
     map_path: Path, log: Path, policy: str, most: int, out: Path, monitor: Monitor
 ) -> list[Localisation]:
     sequence = open_drive(log)
-    options = RobotOptions(policy=policy, lanes=1, rounds=most)
+    options = RobotOptions(ranking=policy, lanes=1, rounds=most)
     with (
         open_map(map_path) as opened,
         robot_on(opened, sequence, Settings(), options) as robot,

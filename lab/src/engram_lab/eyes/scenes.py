@@ -14,7 +14,7 @@ from platformdirs import user_cache_path
 from engram.frontend import Frame, Frontend, FrontendConfig, Landmarks, StereoPair
 from engram.geometry import StereoCamera
 from engram.monitor import QUIET, Monitor
-from engram.sequences import open_sequence
+from engram.sequences import open_drive
 from engram_lab.town.campaigns import WORLD_VERSION
 from engram_lab.town.robots import robot_named
 from engram_lab.town.visits import VISITS, Places, Visit, at
@@ -116,8 +116,8 @@ def judged_scene(seed: int, monitor: Monitor = QUIET) -> Scene:
 
 
 def clip(folder: Path, rig: str = "grey", channel: str = "grey") -> list[StereoPair]:
-    """The stereo pairs of a real clip; for the cameras see `open_sequence`."""
-    drive = open_sequence(folder, rig=rig, channel=channel)
+    """The stereo pairs of a real clip; for the cameras see `open_drive`."""
+    drive = open_drive(folder, rig=rig, channel=channel)
     return [pair for pair in drive if isinstance(pair, StereoPair)]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from engram.frontend import Frame, Frontend, FrontendConfig, MatcherConfig, StereoPair, match_frames
 from engram.geometry import SE3
-from engram.sequences import open_sequence
+from engram.sequences import open_drive
 from engram_lab.bench.data import scale_and_crop
 from engram_lab.charts import Line as Curve
 from engram_lab.charts import Panel, draw_curves
@@ -91,7 +91,7 @@ class Truth:
 
 def kitti_lines(data: Path) -> list[Line]:
     folder = data / "kitti_odometry"
-    read = open_sequence(folder / "sequences" / "06")
+    read = open_drive(folder / "sequences" / "06")
     pairs = [pair for pair in read if isinstance(pair, StereoPair)]
     rows = np.loadtxt(folder / "poses" / "06.txt")
     poses = [SE3.from_matrix(row.reshape(3, 4)) for row in rows]

@@ -24,7 +24,7 @@ from engram.geometry import SE3
 from engram.measures import Drive, route_not_localised
 from engram.monitor import QUIET, Monitor
 from engram.robot import RobotOptions, Settings
-from engram.sequences.opening import open_sequence
+from engram.sequences.opening import open_drive
 from engram_lab.fits.calibration import (
     CLIP_FRAMES,
     CLIP_SPACING_M,
@@ -53,7 +53,7 @@ LAPS = 40
 _EARLY_LAPS = 25
 _EVERYTHING = Configuration("distance", UNLIMITED)
 # Counts only, more of them than there are candidates, one after another: the first success ends it.
-_EXHAUSTIVE = RobotOptions(policy="distance", lanes=1, rounds=UNLIMITED, relocaliser="fabmap")
+_EXHAUSTIVE = RobotOptions(ranking="distance", lanes=1, rounds=UNLIMITED, relocaliser="fabmap")
 # Of `village`: a clear morning, where its road runs straight between houses, as on the clip.
 _SESSION, _FIRST_FRAME = 1, 60
 
@@ -79,7 +79,7 @@ def load_clip() -> list[tuple[SE3, StereoPair]] | None:
     if not root or not clip.is_dir() or not truth.is_file():
         return None
     poses = [SE3.from_matrix(row.reshape(3, 4)) for row in np.loadtxt(truth)]
-    pairs = [pair for pair in open_sequence(clip) if isinstance(pair, StereoPair)]
+    pairs = [pair for pair in open_drive(clip) if isinstance(pair, StereoPair)]
     return list(zip(poses, pairs, strict=False))[:CLIP_FRAMES]
 
 

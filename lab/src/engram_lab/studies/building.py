@@ -23,7 +23,7 @@ from engram_lab.studies.starting import TrueNodes
 
 # Enough for every candidate that matters; counts only, so that the same drives give the same map.
 # Folds are built beside each other, one thread each.
-GENEROUS = RobotOptions(policy="path-near", lanes=4, rounds=8, relocaliser="fabmap", threads=5)
+GENEROUS = RobotOptions(ranking="path-near", lanes=4, rounds=8, relocaliser="fabmap", threads=5)
 
 
 @dataclass(frozen=True, slots=True)

@@ -97,7 +97,9 @@ class BagSequence:
         self.camera: StereoCamera = self.cameras.camera
         check_no_view(options, self.cameras)
         self._mask = None if options.mask is None else read_mask(options.mask, self.cameras)
-        self._shift_ns = 0 if options.start_ns is None else options.start_ns - self._first_ns
+        self._shift_ns = (
+            0 if options.recorded_at_ns is None else options.recorded_at_ns - self._first_ns
+        )
         clock = Clock.UTC if self._first_ns >= YEAR_2000_NS else Clock.RELATIVE
         name = path.resolve().name.split(".")[0]
         self.info = with_options(SequenceInfo(name, "bag", clock), options)

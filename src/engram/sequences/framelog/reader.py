@@ -53,7 +53,7 @@ def open_framelog(path: Path, options: OpenOptions) -> FrameLog:
         )
     for option, value in (
         ("--calibration", options.calibration),
-        ("--fov", options.field_of_view_deg),
+        ("--field-of-view", options.field_of_view_deg),
         ("--mask", options.mask),
     ):
         if value is not None:
@@ -106,7 +106,8 @@ class FrameLog:
                 f"{self._path}: no frame is chosen of the {len(stamps_ns)} in the log "
                 f"(frames {options.frames})"
             )
-        shift_ns = 0 if options.start_ns is None else options.start_ns - int(stamps_ns[0])
+        at_ns = options.recorded_at_ns
+        shift_ns = 0 if at_ns is None else at_ns - int(stamps_ns[0])
         self._shift_ns = shift_ns
         self._stamps_ns = stamps_ns[list(self._numbers)] + shift_ns
         self._motion_files = options.motion

@@ -29,7 +29,7 @@ class Arm:
     @property
     def configuration(self) -> Configuration:
         """How held-out drives are localised."""
-        return Configuration(self.driving.policy, self.driving.lanes, self.driving.rounds)
+        return Configuration(self.driving.ranking, self.driving.lanes, self.driving.rounds)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class ArmRule:
         )
         if self.policy is not None:
             policy, lanes, rounds = self.policy, self.lanes, self.rounds
-            driving = replace(driving, policy=policy, lanes=lanes, rounds=rounds)
+            driving = replace(driving, ranking=policy, lanes=lanes, rounds=rounds)
             merging = replace(merging, ranking=policy, lanes=lanes, rounds=rounds)
         if self.sure_inliers is not None:
             merging = replace(merging, sure_inliers=self.sure_inliers)

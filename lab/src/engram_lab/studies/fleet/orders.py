@@ -35,7 +35,7 @@ class _Judge:
         drive = self._drives[session_of_drive(sequence).id]
         folder = self._plan.folder(self._arm, self._fold)
         memo = MatchMemo.of(opened, drive, settings, folder)
-        configuration = Configuration(options.policy, options.lanes, options.rounds)
+        configuration = Configuration(options.ranking, options.lanes, options.rounds)
         runs = localise_held_out(
             opened, drive, drive.frames(), self._plan.training(self._fold), [configuration],
             settings, memo, options.relocaliser,

@@ -59,7 +59,7 @@ def _asked(arm: ArmResult, rows: Sequence[Row]) -> list[Row]:
     about = {
         "campaign": arm.plan.drives.name,
         "arm": arm.arm.letter,
-        "policy": arm.arm.driving.policy,
+        "policy": arm.arm.driving.ranking,
         "attempts": arm.configuration.budget.attempts if arm.arm.letter != "C" else "all",
     }
     return [{**about, **row} for row in rows if arm.asked(row["experiment"])]

@@ -1,0 +1,46 @@
+"""Keywords of the public functions: a wrong one is an error that names the right ones."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+from engram.errors import ConfigError
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+
+def keywords(**moved: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
+    """Makes a function refuse unknown keywords with a `ConfigError` in place of a `TypeError`.
+
+    Args:
+        **moved: former keywords, and the one that replaced each.
+    """
+
+    def checked(function: Callable[_P, _T]) -> Callable[_P, _T]:
+        known = [
+            one.name
+            for one in inspect.signature(function).parameters.values()
+            if one.name != "self" and one.kind is not one.POSITIONAL_ONLY
+        ]
+
+        @wraps(function)
+        def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+            for unknown in kwargs.keys() - known:
+                near = moved.get(unknown) or next(
+                    iter(difflib.get_close_matches(unknown, known, 1)), None
+                )
+                question = "" if near is None else f"did you mean {near}? "
+                raise ConfigError(
+                    f"{function.__name__}() takes no keyword {unknown!r}; {question}"
+                    f"It takes {', '.join(known)}"
+                )
+            return function(*args, **kwargs)
+
+        return call
+
+    return checked
