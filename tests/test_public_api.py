@@ -4,12 +4,14 @@ import subprocess
 import sys
 
 import engram
+import engram.robot
 
 
 def test_every_public_name_is_there() -> None:
     for name in engram.__all__:
         assert getattr(engram, name) is not None
     assert set(engram._HOMES) == set(engram.__all__) - {"__version__"}
+    assert set(engram.robot._HOMES) == set(engram.robot.__all__)
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
@@ -24,3 +26,20 @@ def test_importing_engram_and_its_program_imports_nothing_heavy() -> None:
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
+
+
+def test_a_drive_that_is_not_there_costs_no_heavy_import(tmp_path) -> None:
+    code = (
+        "import sys\n"
+        "sys.argv = ['engram', 'map', 'town.engram', 'nowhere']\n"
+        "from engram.cli.app import main\n"
+        "try: main()\n"
+        "except SystemExit as end: status = end.code\n"
+        "heavy = {'numpy', 'cv2', 'scipy', 'sqlalchemy', 'matplotlib', 'rich'}\n"
+        "print(status, sorted(heavy & set(sys.modules)))"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert run.stdout.strip() == "2 []"
+    assert run.stderr == "engram: nowhere: there is no such file or folder\n"

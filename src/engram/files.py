@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass
 from glob import escape
 from pathlib import Path
 
-from engram.errors import InputError, MapError, MapLockedError, StorageFullError
+from engram.errors import EngramError, InputError, MapError, MapLockedError, StorageFullError
 
 # struct flock on 64-bit Linux: type, whence, start, length, pid.
 _FLOCK = struct.Struct("hhqqi4x")
@@ -31,6 +31,35 @@ _HOLDER_BYTES = 4096
 # Nobody is led by a link to another file, and nobody waits at a pipe.
 _OPEN_LOCK = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _DRAFT_LOCK = "draft-lock"  # held by the process that writes the draft, for as long as it lives
+
+
+def map_path(location: Path | str) -> Path:
+    """The path of a map file.
+
+    Raises:
+        InputError: it is the address of a database; not shown, as it may hold a password. Or it is
+            not UTF-8, which SQLite needs.
+    """
+    if isinstance(location, str) and location.startswith("postgresql"):
+        raise InputError(
+            "this is the address of a PostgreSQL database, not a map file; the database of a "
+            "centre is given with --database of engram centre"
+        )
+    try:
+        str(location).encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"{location}: the path is not UTF-8; rename file or folder") from error
+    return Path(location)
+
+
+def check_there(path: Path, error: type[EngramError] = InputError) -> None:
+    """Refuses a path that does not exist.
+
+    Raises:
+        EngramError: of the kind `error`.
+    """
+    if not path.exists():
+        raise error(f"{path}: there is no such file or folder")
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,12 +47,12 @@ def map_(
       engram map town.engram drives/tuesday --recorded-at 2026-03-01T09:30:00Z
       engram map town.engram sequences/06 --frames 0:50:2
     """
+    sequence = drive.open(path)
     from engram.cli.progress import Bars
     from engram.cli.wording import mapped_text, warnings
     from engram.robot import Beginning, RobotOptions, map_drive
     from engram.viewing.viewer import viewer_for
 
-    sequence = drive.open(path)
     given = settings.read()
     asked = RobotOptions(**effort.over(given), force=force)
     resolved = _for_people(given.of_robot(features), no_thumbnails)
@@ -154,6 +154,7 @@ def localise(
       engram localise town.engram drives/tuesday --view window
       engram localise town.engram drives/tuesday --explain 120
     """
+    sequence = drive.open(path)
     from engram.cli.explaining import explain_and_print
     from engram.cli.localising import Outputs, localise_and_print
     from engram.robot import RobotOptions, open_map
@@ -161,7 +162,7 @@ def localise(
 
     found_by = None if relocaliser == "none" else relocaliser
     given = settings.read()
-    sequence, resolved, tried = drive.open(path), given.of_robot(), effort.over(given)
+    resolved, tried = given.of_robot(), effort.over(given)
     if explain is None:
         asked = RobotOptions(**tried, deadline_ms=deadline, relocaliser=found_by)
         wanted = Outputs(
@@ -208,10 +209,11 @@ def record(
       engram record drives/monday monday.framelog
       engram record 2011_09_26_drive_0001_sync colour.framelog --rig colour --channel blue
     """
+    sequence = drive.open(path)
     from engram.cli.progress import Bars
     from engram.robot import extract_log
 
-    sequence, resolved = drive.open(path), settings.read().of_robot(features)
+    resolved = settings.read().of_robot(features)
     with losses_told(sequence):
         with Bars().stage("record", len(sequence)) as monitor:
             report = extract_log(sequence, out, resolved, monitor)

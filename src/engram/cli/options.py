@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import typer
 
 from engram.cli.help import LAYOUTS
+from engram.errors import InputError, SequenceError
+from engram.files import check_there, map_path
 
 if TYPE_CHECKING:
     from engram.cli.settings import AllSettings
@@ -28,9 +30,6 @@ def map_file(text: str) -> Path:
     Raises:
         BadParameter: it is an address.
     """
-    from engram.errors import InputError
-    from engram.maps.sqlite import map_path
-
     try:
         return map_path(text)
     except InputError as error:
@@ -204,6 +203,8 @@ class Drive:
 
     def open(self, path: Path) -> OpenDrive:
         """The drive; see `engram.open_drive` for the errors."""
+        check_there(path, SequenceError)  # before half a second of imports
+
         from engram.sequences.opening import open_with
 
         return open_with(path, self.options(), self.format)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sqlalchemy import insert
 
 from engram.errors import InputError, RevisionError
+from engram.files import map_path
 from engram.geometry import StereoCamera
 from engram.graph.model import Amendable, NodeId, SessionId
 from engram.keywords import keywords
@@ -29,7 +30,7 @@ from engram.maps.revisions import (
 )
 from engram.maps.rows import sealed
 from engram.maps.schema import revisions
-from engram.maps.sqlite import SqliteDatabase, map_path
+from engram.maps.sqlite import SqliteDatabase
 from engram.maps.tags import Tag, TagWriter
 from engram.maps.view import View
 from engram.maps.words import words_row, write_words

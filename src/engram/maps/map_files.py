@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from engram.errors import MapCorruptError
-from engram.files import current_holder
+from engram.files import current_holder, map_path
 from engram.maps.checking import check
 from engram.maps.records import CheckReport, Problem
-from engram.maps.sqlite import SqliteDatabase, map_path
+from engram.maps.sqlite import SqliteDatabase
 from engram.maps.write_ahead import log_problems
 
 

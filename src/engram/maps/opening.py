@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from engram.files import map_path
 from engram.keywords import keywords
 from engram.maps.map import Map
-from engram.maps.sqlite import map_path
 
 
 @keywords()

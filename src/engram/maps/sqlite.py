@@ -21,7 +21,7 @@ from sqlalchemy.dialects import sqlite as sqlite_dialect
 from sqlalchemy.schema import CreateTable
 from sqlalchemy.sql.compiler import SQLCompiler
 
-from engram.errors import InputError, MapCorruptError, MapError, NotAMapError, StorageFullError
+from engram.errors import MapCorruptError, MapError, NotAMapError, StorageFullError
 from engram.files import Holder, WriterLock, current_holder, naming, new_file, publish
 from engram.maps.database import (
     damage_named,
@@ -296,25 +296,6 @@ class SqliteDatabase:
             self.format_version = FORMAT_VERSION
             self._end_readers()
             self._reader = self._file.engine(self._options, self._prepare_reader)
-
-
-def map_path(location: Path | str) -> Path:
-    """The path of a map file.
-
-    Raises:
-        InputError: it is the address of a database; not shown, as it may hold a password. Or it is
-            not UTF-8, which SQLite needs.
-    """
-    if isinstance(location, str) and location.startswith("postgresql"):
-        raise InputError(
-            "this is the address of a PostgreSQL database, not a map file; the database of a "
-            "centre is given with --database of engram centre"
-        )
-    try:
-        str(location).encode()
-    except UnicodeEncodeError as error:
-        raise InputError(f"{location}: the path is not UTF-8; rename file or folder") from error
-    return Path(location)
 
 
 def _definition(table: Table) -> str:

@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import TypeAlias
 
 from engram.errors import ConfigError, SequenceError
+from engram.files import check_there
 from engram.keywords import keywords
 from engram.plugins import PluginGroup, check_is
 from engram.sequences.bags import BagSequence, is_bag, open_bag
@@ -282,8 +283,7 @@ def recognise(path: Path) -> str:
     """
     if path.suffix == ".engram":
         raise SequenceError(f"{path}: is the name of a map, not of a drive; the map is given first")
-    if not path.exists():
-        raise SequenceError(f"{path}: there is no such file or folder")
+    check_there(path, SequenceError)
     found = [name for name, layout in _layouts().items() if layout.recognises(path)]
     if len(found) == 1:
         return found[0]
