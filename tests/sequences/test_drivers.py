@@ -169,9 +169,11 @@ class TestCameraInfo:
             images(maker)
         assert_whole(open_drive(tmp_path / "b"))
 
-    def test_without_p_and_transforms_the_pair_is_asked_for(self, tmp_path) -> None:
-        path = StereoBag(PICTURES, infos(**ZEROS)).write(tmp_path / "b", "mcap")
-        with pytest.raises(CalibrationError, match=r"no baseline.*--calibration FILE"):
+    @pytest.mark.parametrize("topic", ["image_raw", "image_rect_raw", "image_rect"])
+    def test_without_p_and_transforms_the_pair_is_asked_for(self, tmp_path, topic) -> None:
+        topics = (f"/s/left/{topic}", f"/s/right/{topic}")
+        path = StereoBag(PICTURES, infos(**ZEROS), topics).write(tmp_path / "b", "mcap")
+        with pytest.raises(CalibrationError, match=r"no projection P.*--calibration FILE"):
             open_drive(path)
 
     def test_one_frame_for_both_cameras_is_no_pose(self, tmp_path) -> None:

@@ -159,7 +159,14 @@ def cameras_of_infos(
     left, right = _completed(left, "left"), _completed(right, "right")
     baseline_m = float(left.p[0, 3] - right.p[0, 3]) / float(left.p[0, 0])
     if baseline_m == 0 and right_from_left is None:
-        raise _no_baseline(left, right)
+        raise (
+            _no_baseline(left, right)
+            if stated
+            else CalibrationError(
+                "no projection P, which states the baseline: calibrate the pair, or give its "
+                "calibration with --calibration FILE"
+            )
+        )
     if rectified:
         left, right = (_seen_through_p(one, stated=stated) for one in (left, right))
         _check_rows(left, right)
