@@ -138,8 +138,8 @@ def folder(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Call
         if state == "mapped":
             return
         for robot, frames, hour in (("r1", "0::2", 11), ("r2", "1::2", 17)):
-            start = f"2026-03-01T{hour}:00:00Z"
-            options = {"frames": frames, "robot": robot, "start": start, "longitude_deg": 0.0}
+            at = f"2026-03-01T{hour}:00:00Z"
+            options = {"frames": frames, "robot": robot, "recorded_at": at, "longitude_deg": 0.0}
             engram.map_drive("fleet.engram", engram.open_drive("street", **options))
         for robot in ("r1", "r2"):
             shutil.copy("fleet.engram", f"{robot}.engram")

@@ -79,8 +79,8 @@ def test_a_missions_hour_is_that_of_its_own_drive(tmp_path, monkeypatch):
         tmp_path / "none.engram", {"tod": DownloadOptions("tod")}, drives, Settings(),
         RobotOptions(), left_out=left.append,
     )  # fmt: skip
-    assert [one.start_h for one in asked] == pytest.approx([8.0, 17.0])
-    assert [one.start_h for one in left] == pytest.approx([8.0, 17.0])
+    assert [one.depart_h for one in asked] == pytest.approx([8.0, 17.0])
+    assert [one.depart_h for one in left] == pytest.approx([8.0, 17.0])
 
 
 def test_nodes_of_a_parallel_build_are_those_after_the_last_merge():

@@ -176,9 +176,9 @@ def test_what_the_centre_cannot_make_is_told_apart_from_a_broken_link(site):
 
 
 def test_settings_of_an_agent_are_read_from_a_file():
-    text = "bytes_per_s = 250000\n[download]\npolicy = 'budget'\nbudget_bytes = 1\n"
+    text = "bytes_per_s = 250000\n[download]\nselect = 'budget'\nbudget_bytes = 1\n"
     read = load_toml(text, AgentSettings)
-    assert (read.bytes_per_s, read.download["policy"]) == (250_000.0, "budget")
+    assert (read.bytes_per_s, read.download["select"]) == (250_000.0, "budget")
     for wrong in (
         lambda: load_toml("bytes_per_s = -1", AgentSettings),
         lambda: AgentSettings(bytes_per_s=-1.0),

@@ -108,7 +108,7 @@ def test_pages_name_people_and_tell_robots_of_one_name_apart(visited):
 def test_a_download_that_cannot_be_made_is_on_the_page_health_with_its_reason(visited):
     who = cookie(visited)
     headers = {**who, "X-Engram": "page"}
-    asked = {"ref": "head", "options": {"policy": "budget", "budget_bytes": 1}}
+    asked = {"ref": "head", "options": {"select": "budget", "budget_bytes": 1}}
     visited.http.post(f"/v1/maps/{NAME}/downloads", json=asked, headers=headers)
     visited.work()
     assert (

@@ -9,7 +9,7 @@ import pytest
 from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
 KEYS = {
-    "out", "policy", "revision", "source_hash", "content_hash", "nodes", "of_nodes", "sessions",
+    "out", "select", "revision", "source_hash", "content_hash", "nodes", "of_nodes", "sessions",
     "partial_paths", "edges", "bridges", "components", "size_bytes", "of_bytes", "why",
     "expected_missed", "copy_missed", "forecast",
 }  # fmt: skip
@@ -95,7 +95,7 @@ def test_an_hour_without_data_is_widened_and_says_so(engram, centre: Path, tmp_p
         (("--select", "region", "--near", "xyz"), "is not a UUID"),
         (("--select", "route", "--route", "00"), "0 sessions begin with '00'"),
         (("--route", "zzzz"), "choose --select tod, paths, tod+paths, route or budget"),
-        (("--region", "zzzz"), "does not use --near (--region)"),
+        (("--near", "zzzz"), "does not use --near"),
         (("--select", "tod", "--depart", "9:30", "--budget", "10kB"), "does not use --budget"),
         (("--select", "budget", "--budget", "1MB", "--near", "ffffffffff"), "begins with"),
         (("--at", "summer"), "it has no tags"),

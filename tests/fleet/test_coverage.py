@@ -146,7 +146,7 @@ def test_who_got_on_with_whom_is_learnt_from_attempts_and_hours(stock):
 def test_a_mission_asks_for_the_map_of_its_own_hour(stock):
     robots = np.array([stock.sessions[at].robot for at in stock.session_of])
     for hour, own in ((9.2, "r1"), (18.1, "r2")):
-        coverage = coverage_for(stock, DownloadOptions(start_h=hour))
+        coverage = coverage_for(stock, DownloadOptions(depart_h=hour))
         missed = {robot: expected_missed(coverage, robots == robot) for robot in ("r1", "r2")}
         other = "r2" if own == "r1" else "r1"
         assert missed[own] + 0.2 < missed[other]

@@ -87,49 +87,51 @@ def test_no_latitude_is_learnt_where_light_does_not_matter_or_nothing_was_tried(
 def test_by_hours_alone_a_november_evening_is_like_one_in_june(no_attempts):
     counts = importance(
         stock(JUNE_EVENING, JUNE_NIGHT),
-        DownloadOptions(start_h=17.2, end_h=17.2, day="2026-11-17"),
+        DownloadOptions(depart_h=17.2, arrive_h=17.2, date="2026-11-17"),
     )
     assert counts[0] > 5 * counts[1]
 
 
 def test_by_the_sun_a_november_evening_is_night(no_attempts):
     past = stock(JUNE_EVENING, JUNE_NIGHT, DECEMBER_EVENING, DECEMBER_NOON)
-    asked = DownloadOptions(start_h=17.2, day="2026-11-17", latitude_deg=51.8)
+    asked = DownloadOptions(depart_h=17.2, date="2026-11-17", latitude_deg=51.8)
     june_evening, june_night, december_evening, december_noon = importance(past, asked)
     assert december_evening > june_night > 2 * december_noon
     assert june_night > 2 * june_evening
-    south = DownloadOptions(start_h=17.2, day="2026-11-17", latitude_deg=-51.8)
+    south = DownloadOptions(depart_h=17.2, date="2026-11-17", latitude_deg=-51.8)
     assert np.argmax(importance(past, south)) == 2  # summer there: a bright evening in December
 
 
 def test_without_a_date_the_mission_is_on_the_day_of_the_newest_drive(no_attempts):
     past = stock(JUNE_EVENING, JUNE_NIGHT, DECEMBER_EVENING, DECEMBER_NOON)
-    asked = {"start_h": 17.2, "end_h": 18.0, "latitude_deg": 51.8}
+    asked = {"depart_h": 17.2, "arrive_h": 18.0, "latitude_deg": 51.8}
     newest = importance(past, DownloadOptions(**asked))
     np.testing.assert_array_equal(
-        newest, importance(past, DownloadOptions(**asked, day="2026-12-20"))
+        newest, importance(past, DownloadOptions(**asked, date="2026-12-20"))
     )
 
 
 def test_all_drives_within_the_hours_of_a_mission_count_alike(no_attempts):
     drives = [session(n, datetime(2026, 6, 20, 8 + n, tzinfo=UTC)) for n in range(4)]
     over_midnight = [session(5 + n, datetime(2026, 6, 20, n, tzinfo=UTC)) for n in (1, 23)]
-    counts = importance(stock(*drives, *over_midnight), DownloadOptions(start_h=8.5, end_h=10.2))
+    counts = importance(
+        stock(*drives, *over_midnight), DownloadOptions(depart_h=8.5, arrive_h=10.2)
+    )
     assert counts[1] == counts[2] == counts.max()
     assert counts[0] < counts[1]
-    night = importance(stock(*drives, *over_midnight), DownloadOptions(start_h=22.0, end_h=2.0))
+    night = importance(stock(*drives, *over_midnight), DownloadOptions(depart_h=22.0, arrive_h=2.0))
     assert night[4] == night[5] == night.max()
 
 
 def test_drives_without_a_known_hour_count_a_little(no_attempts):
     unknown = session(9, datetime(2026, 6, 20, 8, tzinfo=UTC), longitude_deg=None)
-    counts = importance(stock(JUNE_EVENING, unknown), DownloadOptions(start_h=17.0))
+    counts = importance(stock(JUNE_EVENING, unknown), DownloadOptions(depart_h=17.0))
     assert 0 < counts[1] < 0.2 < counts[0]
     np.testing.assert_array_equal(importance(stock(unknown), DownloadOptions()), [1.0])
 
 
 def test_what_is_no_date_or_latitude_is_refused():
     with pytest.raises(ConfigError, match="must be a day such as"):
-        DownloadOptions(day="17.11.2026")
+        DownloadOptions(date="17.11.2026")
     with pytest.raises(ConfigError, match="latitude_deg is 91"):
         DownloadOptions(latitude_deg=91.0)

@@ -61,8 +61,8 @@ def centre(tmp_path_factory) -> Path:
     return path
 
 
-def sent(centre: Path, out: Path, policy: str, **options) -> DownloadReport:
-    return download(centre, out, DownloadOptions(policy, **options))
+def sent(centre: Path, out: Path, select: str, **options) -> DownloadReport:
+    return download(centre, out, DownloadOptions(select, **options))
 
 
 def robots_of(path: Path) -> dict[str, int]:
@@ -81,11 +81,11 @@ def node_ids(path: Path) -> set:
 
 POLICIES = {
     "copy": {},
-    "tod": {"start_h": 9.0, "window_min": 60.0},
-    "paths": {"start_h": 18.0, "end_h": 18.0},
-    "tod+paths": {"start_h": 9.0, "window_min": 60.0, "best_percent": 50.0},
+    "tod": {"depart_h": 9.0, "window_min": 60.0},
+    "paths": {"depart_h": 18.0, "arrive_h": 18.0},
+    "tod+paths": {"depart_h": 9.0, "window_min": 60.0, "best_percent": 50.0},
     "route": {"route": None, "radius_m": 3.0},
-    "budget": {"budget_bytes": 600_000, "start_h": 9.0},
+    "budget": {"budget_bytes": 600_000, "depart_h": 9.0},
 }
 
 
@@ -157,7 +157,7 @@ def test_copy_holds_all_that_the_centre_shows(centre, tmp_path):
 
 def test_words_go_along_and_make_no_difference_to_the_bytes(centre, tmp_path):
     vocabulary = default_vocabulary(BRIEF)
-    sent(centre, tmp_path / "before.engram", "tod", start_h=9.0)
+    sent(centre, tmp_path / "before.engram", "tod", depart_h=9.0)
     keeping = tmp_path / "keeping.engram"
     copy_map(centre, keeping)
     with Map.open(keeping, writes=True) as store:
@@ -166,7 +166,7 @@ def test_words_go_along_and_make_no_difference_to_the_bytes(centre, tmp_path):
         assert not words.kept
         words.keep_missing(nodes)
         kept = NodeWords.of_map(store, vocabulary).kept
-    sent(keeping, tmp_path / "after.engram", "tod", start_h=9.0)
+    sent(keeping, tmp_path / "after.engram", "tod", depart_h=9.0)
     with Map.open(tmp_path / "after.engram") as store:
         went = NodeWords.of_map(store, vocabulary).kept
     assert set(went) == node_ids(tmp_path / "after.engram")
@@ -176,17 +176,17 @@ def test_words_go_along_and_make_no_difference_to_the_bytes(centre, tmp_path):
 
 def test_tod_sends_what_was_saved_near_that_hour_over_midnight_too(centre, tmp_path):
     everything = robots_of(centre)
-    sent(centre, tmp_path / "morning.engram", "tod", start_h=9.0, window_min=60.0)
+    sent(centre, tmp_path / "morning.engram", "tod", depart_h=9.0, window_min=60.0)
     assert robots_of(tmp_path / "morning.engram") == {
         name: everything[name] for name in ("r1", "r3")
     }
     # 23:45 and later is within 30 minutes of 0:05.
-    sent(centre, tmp_path / "night.engram", "tod", start_h=5 / 60, window_min=30.0)
+    sent(centre, tmp_path / "night.engram", "tod", depart_h=5 / 60, window_min=30.0)
     assert robots_of(tmp_path / "night.engram") == {"r4": everything["r4"]}
 
 
 def test_paths_send_every_node_of_the_chosen_drives(centre, tmp_path):
-    report = sent(centre, tmp_path / "out.engram", "paths", start_h=18.0, end_h=18.0)
+    report = sent(centre, tmp_path / "out.engram", "paths", depart_h=18.0, arrive_h=18.0)
     with Map.open(centre) as store:
         contents = store.load()
     r2 = next(session for session in contents.sessions if session.robot == "r2")
@@ -198,8 +198,8 @@ def test_paths_send_every_node_of_the_chosen_drives(centre, tmp_path):
 
 
 def test_tod_and_paths_send_what_passes_both(centre, tmp_path):
-    both = sent(centre, tmp_path / "both.engram", "tod+paths", start_h=9.0, window_min=60.0)
-    sent(centre, tmp_path / "tod.engram", "tod", start_h=9.0, window_min=60.0)
+    both = sent(centre, tmp_path / "both.engram", "tod+paths", depart_h=9.0, window_min=60.0)
+    sent(centre, tmp_path / "tod.engram", "tod", depart_h=9.0, window_min=60.0)
     assert node_ids(tmp_path / "both.engram") <= node_ids(tmp_path / "tod.engram")
     assert both.nodes > 0
 
@@ -219,7 +219,7 @@ def test_entries_left_behind_make_a_path_partial(centre, tmp_path):
 
 def test_gaps_are_closed_by_bridges_and_no_more_pieces_come(centre, tmp_path):
     # The evenings hang together through the mornings only.
-    report = sent(centre, tmp_path / "out.engram", "tod", start_h=21.0, window_min=180.0)
+    report = sent(centre, tmp_path / "out.engram", "tod", depart_h=21.0, window_min=180.0)
     with Map.open(tmp_path / "out.engram") as store:
         kinds = store.info().edges_of_kind
     assert set(robots_of(tmp_path / "out.engram")) == {"r2", "r4"}
@@ -238,7 +238,7 @@ def test_a_budget_is_kept_and_more_of_it_promises_more(centre, tmp_path):
     for percent in (30, 60, 100):
         out = tmp_path / f"{percent}.engram"
         budget = whole.size_bytes * percent // 100
-        report = sent(centre, out, "budget", budget_bytes=budget, start_h=9.2)
+        report = sent(centre, out, "budget", budget_bytes=budget, depart_h=9.2)
         assert out.stat().st_size == report.size_bytes <= budget
         assert report.expected_missed <= before
         before = report.expected_missed
@@ -249,17 +249,17 @@ def test_a_budget_is_kept_and_more_of_it_promises_more(centre, tmp_path):
 
 
 def test_a_budget_can_be_a_share_of_everything_sent_alike(centre, tmp_path):
-    everything = sent(centre, tmp_path / "all.engram", "budget", budget_percent=100, start_h=9.2)
+    everything = sent(centre, tmp_path / "all.engram", "budget", budget_percent=100, depart_h=9.2)
     assert everything.nodes == everything.of_nodes
     assert everything.why["everything_bytes"] == everything.size_bytes
-    half = sent(centre, tmp_path / "half.engram", "budget", budget_percent=50, start_h=9.2)
+    half = sent(centre, tmp_path / "half.engram", "budget", budget_percent=50, depart_h=9.2)
     assert 0.9 < half.size_bytes / (everything.size_bytes // 2) <= 1
     as_bytes = sent(
         centre,
         tmp_path / "bytes.engram",
         "budget",
         budget_bytes=everything.size_bytes // 2,
-        start_h=9.2,
+        depart_h=9.2,
     )
     assert as_bytes.nodes == half.nodes
     assert "of the" in half.text()
@@ -269,7 +269,7 @@ def test_a_budget_can_be_a_share_of_everything_sent_alike(centre, tmp_path):
 def test_a_robot_works_with_the_download_alone_and_hands_back_what_it_added(centre, tmp_path):
     mine = Path(shutil.copy(centre, tmp_path / "centre.engram"))
     robot = tmp_path / "robot.engram"
-    sent(mine, robot, "tod", start_h=9.0, window_min=60.0)
+    sent(mine, robot, "tod", depart_h=9.0, window_min=60.0)
     morning = steps_of(9.2, 0, 40, 40, day=7, aside_m=0.4)
     found = localise_simulated(robot, morning)
     assert np.mean([one.node is not None for one in found]) > 0.9
@@ -288,7 +288,7 @@ def test_a_robot_works_with_the_download_alone_and_hands_back_what_it_added(cent
     assert {node.id for node in contents.nodes} >= set(added)
     assert not any(edge.kind is EdgeKind.BRIDGE for edge in contents.edges)
     # The next robot that leaves at noon gets it.
-    sent(mine, tmp_path / "next.engram", "tod", start_h=12.0, window_min=30.0)
+    sent(mine, tmp_path / "next.engram", "tod", depart_h=12.0, window_min=30.0)
     assert node_ids(tmp_path / "next.engram") == set(added)
 
 
@@ -360,14 +360,14 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("options", "says"),
         [
-            ({"policy": "best"}, "known: copy, tod"),
-            ({"policy": "tod"}, "needs --depart"),
-            ({"policy": "tod+paths"}, "needs --depart"),
-            ({"policy": "budget"}, "needs --budget"),
-            ({"policy": "region"}, "needs --near"),
-            ({"policy": "route"}, "needs --route"),
-            ({"policy": "tod", "start_h": 24.0}, "start_h is 24.0"),
-            ({"policy": "tod", "start_h": float("nan")}, "start_h is nan"),
+            ({"select": "best"}, "known: copy, tod"),
+            ({"select": "tod"}, "needs --depart"),
+            ({"select": "tod+paths"}, "needs --depart"),
+            ({"select": "budget"}, "needs --budget"),
+            ({"select": "region"}, "needs --near"),
+            ({"select": "route"}, "needs --route"),
+            ({"select": "tod", "depart_h": 24.0}, "depart_h is 24.0"),
+            ({"select": "tod", "depart_h": float("nan")}, "depart_h is nan"),
             ({"window_min": -1.0}, "window_min is -1.0, must be >= 0"),
             ({"epoch_min": 0.0}, "epoch_min is 0.0"),
             ({"best_percent": 101.0}, "best_percent is 101.0"),
@@ -380,7 +380,7 @@ class TestMistakes:
         ],
     )
     def test_options_that_do_not_fit(self, centre, tmp_path, options, says):
-        policy = options.pop("policy", "copy")
+        policy = options.pop("select", "copy")
         with pytest.raises(ConfigError, match=says):
             sent(centre, tmp_path / "out.engram", policy, **options)
         assert not (tmp_path / "out.engram").exists()
@@ -389,17 +389,17 @@ class TestMistakes:
         ("options", "says"),
         [
             (
-                {"policy": "tod", "start_h": 13.0, "window_min": 30.0, "strict": True},
+                {"select": "tod", "depart_h": 13.0, "window_min": 30.0, "strict": True},
                 "no node was saved within 30",
             ),
             (
-                {"policy": "paths", "start_h": 12.0, "end_h": 13.0, "strict": True},
+                {"select": "paths", "depart_h": 12.0, "arrive_h": 13.0, "strict": True},
                 "no epoch from 12:00 to 13:00",
             ),
-            ({"policy": "region", "near": ("zz",)}, "is not a UUID"),
-            ({"policy": "region", "near": ("00000000",)}, "begins with"),
-            ({"policy": "route", "route": "00000000"}, "0 sessions begin with"),
-            ({"policy": "budget", "budget_bytes": 5000}, "not one node fits into 5000"),
+            ({"select": "region", "near": ("zz",)}, "is not a UUID"),
+            ({"select": "region", "near": ("00000000",)}, "begins with"),
+            ({"select": "route", "route": "00000000"}, "0 sessions begin with"),
+            ({"select": "budget", "budget_bytes": 5000}, "not one node fits into 5000"),
         ],
     )
     def test_nothing_to_send(self, centre, tmp_path, options, says):
@@ -410,15 +410,15 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("options", "says"),
         [
-            ({"policy": "copy", "route": "zzzz"}, "copy does not use --route"),
-            ({"policy": "copy", "near": ("ffff",)}, "does not use --near"),
-            ({"policy": "tod", "start_h": 9.0, "budget_bytes": 10_000}, "choose --select budget"),
-            ({"policy": "copy", "route": "0"}, "choose --select tod, paths"),
-            ({"policy": "region", "near": ("0",), "budget_bytes": 10_000}, "use --budget"),
-            ({"policy": "region", "near": ("0",), "budget_percent": 50.0}, "use --budget"),
-            ({"policy": "budget", "budget_bytes": 9, "near": ("0",), "route": "0"}, "only one of"),
-            ({"policy": "copy", "end_h": 9.0}, "needs --depart with --arrive"),
-            ({"policy": "copy", "day": "2026-11-17"}, "at --depart"),
+            ({"select": "copy", "route": "zzzz"}, "copy does not use --route"),
+            ({"select": "copy", "near": ("ffff",)}, "does not use --near"),
+            ({"select": "tod", "depart_h": 9.0, "budget_bytes": 10_000}, "choose --select budget"),
+            ({"select": "copy", "route": "0"}, "choose --select tod, paths"),
+            ({"select": "region", "near": ("0",), "budget_bytes": 10_000}, "use --budget"),
+            ({"select": "region", "near": ("0",), "budget_percent": 50.0}, "use --budget"),
+            ({"select": "budget", "budget_bytes": 9, "near": ("0",), "route": "0"}, "only one of"),
+            ({"select": "copy", "arrive_h": 9.0}, "needs --depart with --arrive"),
+            ({"select": "copy", "date": "2026-11-17"}, "at --depart"),
         ],
     )
     def test_options_that_a_policy_would_pass_over(self, centre, tmp_path, options, says):
@@ -428,7 +428,7 @@ class TestMistakes:
 
     def test_every_option_has_a_policy_that_goes_by_it(self):
         assert UNDERSTOOD.keys() == SELECTIONS.keys()
-        mission = {"start_h", "end_h", "day", "latitude_deg"}
+        mission = {"depart_h", "arrive_h", "date", "latitude_deg"}
         settings = {
             "window_min",
             "epoch_min",
@@ -439,7 +439,7 @@ class TestMistakes:
         }
         fields = {one.name for one in dataclasses.fields(DownloadOptions)}
         assert frozenset().union(*UNDERSTOOD.values()) == fields - mission - settings - {
-            "policy",
+            "select",
             "thumbnails",
         }
 
@@ -449,7 +449,7 @@ class TestMistakes:
 
         monkeypatch.setattr("engram.fleet.download.downloading._report", fails)
         with pytest.raises(MapError, match="no report"):
-            sent(centre, tmp_path / "out.engram", "tod", start_h=9.0)
+            sent(centre, tmp_path / "out.engram", "tod", depart_h=9.0)
         assert list(tmp_path.iterdir()) == []
 
     def test_places_that_cannot_be_read_or_written(self, centre, tmp_path):
@@ -469,10 +469,10 @@ class TestMistakes:
         map_simulated(timeless, steps_of(9.0, 0, 5, 5, day=1), "r1")
         options = {"budget_bytes": 10**6} if policy == "budget" else {}
         with pytest.raises(InputError, match=r"1 of 1 sessions \(r1 .*engram amend"):
-            sent(timeless, tmp_path / "out.engram", policy, start_h=9.0, **options)
+            sent(timeless, tmp_path / "out.engram", policy, depart_h=9.0, **options)
         # Without a time it can be chosen by what promises most.
         assert sent(timeless, tmp_path / "out.engram", "budget", budget_bytes=10**6).nodes > 0
 
 
 def test_options_are_plain_values():
-    assert dataclasses.asdict(DownloadOptions())["policy"] == "copy"
+    assert dataclasses.asdict(DownloadOptions())["select"] == "copy"

@@ -68,7 +68,7 @@ def stock(centre) -> Iterator[Stock]:
 
 
 def options_of(stock: Stock, policy: str, place: str, hour: float | None, **more):
-    given: dict = {"start_h": hour, "window_min": 60.0, "radius_m": 2.0} | more
+    given: dict = {"depart_h": hour, "window_min": 60.0, "radius_m": 2.0} | more
     if policy == "budget":
         given["budget_percent"] = 60.0
     if place in {"route", "both"}:
@@ -110,7 +110,7 @@ def test_every_mission_is_as_connected_as_the_fleet_map_and_says_what_it_did(
 
 @pytest.mark.parametrize("policy", BY_TIME)
 def test_strict_refuses_an_hour_without_data(centre, stock, tmp_path, policy):
-    options = options_of(stock, policy, "anywhere", WITHOUT, end_h=4.0, strict=True)
+    options = options_of(stock, policy, "anywhere", WITHOUT, arrive_h=4.0, strict=True)
     with pytest.raises(InputError, match=r"window_min|buffer_min"):
         download(centre, tmp_path / "out.engram", options)
 
@@ -150,7 +150,7 @@ def test_light_is_told_by_the_sun_where_the_latitude_is_known(stock):
     """Drives at 9:00 and 18:00 in January: at 60° north the sun is down by 18:00."""
 
     def alike(hour: float | None, latitude_deg: float | None) -> bool | None:
-        return Light.of(stock, DownloadOptions(start_h=hour, latitude_deg=latitude_deg)).alike
+        return Light.of(stock, DownloadOptions(depart_h=hour, latitude_deg=latitude_deg)).alike
 
     assert alike(23.0, 60.0) is True  # as dark as 18:00
     assert alike(12.0, 0.0) is True

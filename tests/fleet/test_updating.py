@@ -240,7 +240,7 @@ class World:
             near = (str(self.rng.choice(found.nodes).id),)
             return DownloadOptions("region", near=near, radius_m=2.0)
         if policy == "tod":
-            return DownloadOptions("tod", start_h=self.rng.uniform(0, 23.9), window_min=720.0)
+            return DownloadOptions("tod", depart_h=self.rng.uniform(0, 23.9), window_min=720.0)
         if policy == "route":
             driven = {one.path for one in found.path_entries}
             drives = [one.id for one in found.sessions if path_id(one.id) in driven]
@@ -342,7 +342,7 @@ def test_updated_equals_fresh_united_with_own_in_a_thousand_histories(tmp_path, 
 
 def test_a_file_that_was_downloaded_is_a_source_too(tmp_path):
     world = World(tmp_path, 3)
-    options = DownloadOptions("tod", start_h=12.0, window_min=720.0)
+    options = DownloadOptions("tod", depart_h=12.0, window_min=720.0)
     one, other = tmp_path / "one.engram", tmp_path / "file.engram"
     shutil.copy(world.robot, one)
     download(world.centre, other, options)

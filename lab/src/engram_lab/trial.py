@@ -110,18 +110,18 @@ class LeftOut:
     Attributes:
         name: of the options.
         drive: session of the drive, as text.
-        start_h: the drive's hour of day; None if it is not known.
+        depart_h: the drive's hour of day; None if it is not known.
         why: what was not found.
     """
 
     name: str
     drive: str
-    start_h: float | None
+    depart_h: float | None
     why: str
 
     def text(self) -> str:
         """One line for people."""
-        hour = "" if self.start_h is None else f", of {self.start_h:.1f} h"
+        hour = "" if self.depart_h is None else f", of {self.depart_h:.1f} h"
         return f"{self.name:16s} left out {self.drive}{hour}: {self.why}"
 
 
@@ -244,7 +244,7 @@ def _trial(
 def _when(session: Session, hour: float) -> dict[str, Any]:
     """The mission is the drive itself."""
     day = datetime.fromtimestamp(session.start_ns / 1e9, UTC).date().isoformat()
-    return {"start_h": hour, "end_h": hour, "day": day}
+    return {"depart_h": hour, "arrive_h": hour, "date": day}
 
 
 def summarise_trials(trials: Sequence[Trial]) -> list[TrialSummary]:

@@ -71,7 +71,7 @@ def test_a_drive_for_whose_hour_there_is_nothing_is_a_row_of_its_own(
     mine, whole, left_out = ran.json
     assert (mine["name"], mine["drives"], whole["name"], whole["drives"]) == ("tod", 1, "copy", 1)
     assert (left_out["name"], left_out["drive"]) == ("tod", str(night))
-    assert left_out["start_h"] == pytest.approx(22.5, abs=0.01)
+    assert left_out["depart_h"] == pytest.approx(22.5, abs=0.01)
     assert "no node was saved within 180 minutes of 22:" in left_out["why"]
     assert f"left out {night}, of 22.5 h: no node was saved" in engram(*asked).out
 
@@ -96,4 +96,4 @@ def test_downloads_and_the_drive_are_as_the_settings_say(
     ((_, wanted, _, _, robot, _),) = calls
     for options in wanted.values():
         assert {name: getattr(options, name) for name in values} == values
-    assert (robot.policy, robot.lanes, robot.rounds, robot.threads) == ("distance", 3, 1, 4)
+    assert (robot.ranking, robot.lanes, robot.rounds, robot.threads) == ("distance", 3, 1, 4)

@@ -26,7 +26,7 @@ from engram_lab.fleet_day.proxy import CuttingProxy, cutting
 from engram_lab.fleet_day.robot import DayRobot
 from engram_lab.fleet_day.stages import Stages
 
-COPY = {"policy": "copy"}
+COPY = {"select": "copy"}
 
 
 class Town:

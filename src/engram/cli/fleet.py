@@ -182,7 +182,6 @@ def download(
         list[str] | None,
         typer.Option(
             "--near",
-            "--region",
             metavar="NODE",
             help="Only around this node; repeatable; not for copy.",
         ),
@@ -230,9 +229,9 @@ def download(
     budget_bytes, budget_percent = budget_from_text(budget)
     asked = settings.read().download.options(
         select,
-        start_h=hour_from_text(depart, "depart"),
-        end_h=hour_from_text(arrive, "arrive"),
-        day=date,
+        depart_h=hour_from_text(depart, "depart"),
+        arrive_h=hour_from_text(arrive, "arrive"),
+        date=date,
         budget_bytes=budget_bytes,
         budget_percent=budget_percent,
         near=tuple(near or ()),

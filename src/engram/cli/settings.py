@@ -103,12 +103,12 @@ class DownloadSettings:
     def __post_init__(self) -> None:
         check_bounds(self)
 
-    def options(self, policy: str, **mission: Any) -> DownloadOptions:
+    def options(self, select: str, **mission: Any) -> DownloadOptions:
         """What to download by these settings; see `DownloadOptions` for what a mission is."""
         from engram.fleet.download import DownloadOptions
 
         own = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
-        return DownloadOptions(policy, **{**own, **mission})
+        return DownloadOptions(select, **{**own, **mission})
 
 
 @dataclass(frozen=True, slots=True)

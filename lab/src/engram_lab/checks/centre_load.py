@@ -44,7 +44,7 @@ _FORAY_NODES = 20
 _NEW_NODES = 50
 _ASK_S = 0.05
 _PROGRAM = "import sys; from engram.cli import main; sys.argv[0] = 'engram'; main()"
-_MISSION = {"policy": "budget", "budget_percent": 25.0}
+_MISSION = {"select": "budget", "budget_percent": 25.0}
 
 
 def made_centre(folder: Path, nodes: int) -> Centre:

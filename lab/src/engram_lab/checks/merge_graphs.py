@@ -309,7 +309,7 @@ def _downloads(centre: Path, seed: int, case: Case) -> Iterator[str]:
             download(centre, copy, options)
     except InputError:
         return  # the centre has nothing for that hour, or the budget is too small for one node
-    case.sent = options.policy
+    case.sent = options.select
     if copies[0].read_bytes() != copies[1].read_bytes():
         yield f"{options}: made again it has other bytes"
     if problems := check_file(copies[0]).problems:
@@ -332,11 +332,11 @@ def _mission(rng: random.Random, centre: Path, nodes: list[NodeId]) -> DownloadO
         return DownloadOptions(policy, near=(str(rng.choice(nodes)),), radius_m=3.0)
     if policy == "budget":
         size = rng.randrange(centre.stat().st_size // 2, centre.stat().st_size)
-        return DownloadOptions(policy, start_h=hour, end_h=hour, budget_bytes=size)
+        return DownloadOptions(policy, depart_h=hour, arrive_h=hour, budget_bytes=size)
     if policy == "tod":
-        return DownloadOptions(policy, start_h=hour)
+        return DownloadOptions(policy, depart_h=hour)
     if policy in ("paths", "tod+paths"):
-        return DownloadOptions(policy, start_h=hour, epoch_min=360.0)
+        return DownloadOptions(policy, depart_h=hour, epoch_min=360.0)
     return DownloadOptions(policy)
 
 

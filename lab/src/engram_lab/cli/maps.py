@@ -185,8 +185,8 @@ def try_(
     asked = given.download.options(
         policy,
         strict="tod" in policy or policy == "paths",  # an hour without data is a row of its own
-        start_h=hour_from_text(start, "start"),
-        end_h=hour_from_text(end, "end"),
+        depart_h=hour_from_text(start, "start"),
+        arrive_h=hour_from_text(end, "end"),
         budget_bytes=budget_bytes,
         budget_percent=budget_percent,
     )
@@ -196,7 +196,7 @@ def try_(
     left_out: list[LeftOut] = []
     trials = try_downloads(
         centre,
-        {asked.policy: asked, "copy": given.download.options("copy")},
+        {asked.select: asked, "copy": given.download.options("copy")},
         [partial(open_drive, drive) for drive in drives],
         given.of_robot(),
         RobotOptions(**effort.over(given)),

@@ -30,9 +30,9 @@ _CUT_BYTES = 200_000
 _FAREWELL_S = 5
 # First and second foray of each robot, and what it downloads in between.
 _ROBOTS: dict[str, tuple[int, int, dict[str, Any]]] = {
-    "r1": (0, 3, {"policy": "copy"}),
-    "r2": (1, 4, {"policy": "tod+paths", "start_h": 10.0, "end_h": 11.0, "buffer_min": 120.0}),
-    "r3": (2, 5, {"policy": "budget", "budget_percent": 50.0, "start_h": 9.0}),
+    "r1": (0, 3, {"select": "copy"}),
+    "r2": (1, 4, {"select": "tod+paths", "depart_h": 10.0, "arrive_h": 11.0, "buffer_min": 120.0}),
+    "r3": (2, 5, {"select": "budget", "budget_percent": 50.0, "depart_h": 9.0}),
 }
 
 

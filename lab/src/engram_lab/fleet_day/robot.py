@@ -53,7 +53,7 @@ class Foray:
 
     Attributes:
         robot: its name.
-        download: the policy by which the fleet's map was cut for it.
+        download: the selection by which the fleet's map was cut for it.
         alone: the drive with its own map.
         shared: the same drive with the download.
         fell_back: whether the robot went back to its own map afterwards.
@@ -119,7 +119,7 @@ class DayRobot:
             EngramError: the centre cannot make it, or it takes too many rounds.
         """
         with self._agent(options) as agent:
-            what = f"{self.name} downloads, {options['policy']}"
+            what = f"{self.name} downloads, {options['select']}"
             self._rounds(agent, what, lambda: agent.status()["staged"] is not None)
             if not agent.switch():
                 raise EngramError(f"{self.name} did not switch: {agent.status()}")
@@ -136,7 +136,7 @@ class DayRobot:
         self.hand_in("second")
         return Foray(
             self.name,
-            options["policy"],
+            options["select"],
             alone,
             shared,
             fell_back,

@@ -95,7 +95,7 @@ class DownloadRequest(Body):
 
     ref: Annotated[str, Field(max_length=60, examples=["stable"])] = "head"
     options: Annotated[
-        dict[str, Any], Field(examples=[{"policy": "tod+paths", "start_h": 9.5, "end_h": 11.0}])
+        dict[str, Any], Field(examples=[{"select": "tod+paths", "depart_h": 9.5, "arrive_h": 11.0}])
     ] = {}
 
 

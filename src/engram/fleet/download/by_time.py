@@ -37,10 +37,10 @@ def near_start(stock: Stock, options: DownloadOptions, where: Mask) -> tuple[Mas
         ConfigError: the mission has no start.
         InputError: no hour is known; or, if `strict`, no node fits.
     """
-    if options.start_h is None:
-        raise ConfigError(f"selection {options.policy} needs --depart, the mission's time of day")
+    if options.depart_h is None:
+        raise ConfigError(f"selection {options.select} needs --depart, the mission's time of day")
     hours = stock.known_hours()
-    apart_h = np.abs(hours - options.start_h)
+    apart_h = np.abs(hours - options.depart_h)
     apart_h = np.nan_to_num(np.minimum(apart_h, _HOURS - apart_h), nan=np.inf)
     facts: dict[str, Any] = {"nodes_without_hour": int(np.isnan(hours).sum())}
     for window_min in _windows(options.window_min, options):
@@ -50,8 +50,8 @@ def near_start(stock: Stock, options: DownloadOptions, where: Mask) -> tuple[Mas
     if options.strict:
         raise InputError(
             f"no node was saved within {options.window_min:.0f} minutes of "
-            f"{_clock(options.start_h)}; widen it with --set download.window_min=MINUTES, or leave "
-            "out --strict"
+            f"{_clock(options.depart_h)}; widen it with --set download.window_min=MINUTES, or "
+            "leave out --strict"
         )
     return where, facts | _everything(options)
 
@@ -77,7 +77,7 @@ def _epochs(counts: PathCounts, options: DownloadOptions) -> tuple[list[int], di
     for buffer_min in _windows(options.buffer_min, options):
         mission = replace(options, buffer_min=buffer_min)
         try:
-            found = mission_epochs(counts, mission.start_h, mission.end_h, buffer_min)
+            found = mission_epochs(counts, mission.depart_h, mission.arrive_h, buffer_min)
         except InputError as error:
             refused = refused or error
         else:
@@ -109,7 +109,7 @@ def _everything(options: DownloadOptions) -> dict[str, Any]:
 
 
 def _mission(options: DownloadOptions) -> str:
-    ends = [_clock(one) for one in (options.start_h, options.end_h) if one is not None]
+    ends = [_clock(one) for one in (options.depart_h, options.arrive_h) if one is not None]
     return " to ".join(dict.fromkeys(ends)) or "the mission"
 
 

@@ -54,7 +54,7 @@ _PRIORS = (0.01, 0.04, 1.0)  # precisions: level, slope, each session's own
 
 def importance(stock: Stock, options: DownloadOptions) -> Array:
     """(S,) weight of each past session for a mission; all 1 if the mission has no time."""
-    if options.start_h is None:
+    if options.depart_h is None:
         return np.ones(len(stock.sessions))
     hours = np.array([_nan(hour_of_day(one, one.start_ns)) for one in stock.sessions], np.float64)
     latitude_deg = None if not np.isfinite(hours).all() else latitude_of(stock, options)
@@ -75,7 +75,7 @@ def light_apart_deg(stock: Stock, options: DownloadOptions) -> float | None:
         latitude are unknown.
     """
     hours = np.array([_nan(hour_of_day(one, one.start_ns)) for one in stock.sessions], np.float64)
-    if options.start_h is None or not np.isfinite(hours).all():
+    if options.depart_h is None or not np.isfinite(hours).all():
         return None
     latitude_deg = latitude_of(stock, options)
     if latitude_deg is None:
@@ -88,9 +88,9 @@ def light_apart_deg(stock: Stock, options: DownloadOptions) -> float | None:
 def nearest_hours(stock: Stock, options: DownloadOptions) -> float:
     """Hours from a mission's start to the time of day of the nearest drive; infinite if unknown."""
     starts = [hour_of_day(one, one.start_ns) for one in stock.sessions]
-    if options.start_h is None:
+    if options.depart_h is None:
         return np.inf
-    apart = [abs((options.start_h - one + 12) % 24 - 12) for one in starts if one is not None]
+    apart = [abs((options.depart_h - one + 12) % 24 - 12) for one in starts if one is not None]
     return min(apart, default=np.inf)
 
 
@@ -178,10 +178,10 @@ class _Pairs:
 
 def _near_in_hours(hours: Array, options: DownloadOptions, spread_h: float) -> Array:
     """(S,) 1 within the mission's hours, falling with the distance from them; 0 if unknown."""
-    assert options.start_h is not None
-    end_h = options.start_h if options.end_h is None else options.end_h
-    length_h = (end_h - options.start_h) % 24
-    since_h = (hours - options.start_h) % 24
+    assert options.depart_h is not None
+    arrive_h = options.depart_h if options.arrive_h is None else options.arrive_h
+    length_h = (arrive_h - options.depart_h) % 24
+    since_h = (hours - options.depart_h) % 24
     apart_h = np.where(since_h <= length_h, 0.0, np.minimum(since_h - length_h, 24 - since_h))
     return np.asarray(np.nan_to_num(np.exp(-0.5 * (apart_h / spread_h) ** 2)))
 
@@ -190,14 +190,14 @@ def _mission_heights(
     stock: Stock, options: DownloadOptions, latitude_deg: float
 ) -> tuple[float, float]:
     """The lowest and the highest sun of the mission."""
-    assert options.start_h is not None
-    if options.day is not None:
-        day = float(date.fromisoformat(options.day).timetuple().tm_yday - 1)
+    assert options.depart_h is not None
+    if options.date is not None:
+        day = float(date.fromisoformat(options.date).timetuple().tm_yday - 1)
     else:
         day = day_of_year(max(one.begin_ns for one in stock.sessions))
-    end_h = options.start_h if options.end_h is None else options.end_h
-    span = np.linspace(0.0, (end_h - options.start_h) % 24, 25)
-    hours = (options.start_h + span) % 24
+    arrive_h = options.depart_h if options.arrive_h is None else options.arrive_h
+    span = np.linspace(0.0, (arrive_h - options.depart_h) % 24, 25)
+    hours = (options.depart_h + span) % 24
     height = np.clip(sun_height_deg(day, hours, latitude_deg), _NIGHT_DEG, _NOON_DEG)
     return float(height.min()), float(height.max())
 

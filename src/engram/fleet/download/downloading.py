@@ -53,7 +53,7 @@ class DownloadReport:
 
     Attributes:
         out: the file.
-        policy: key of `SELECTIONS`.
+        select: key of `SELECTIONS`.
         revision: of the centre.
         source_hash, content_hash: of the fleet map and of the file.
         nodes, of_nodes: sent, and all.
@@ -61,14 +61,14 @@ class DownloadReport:
         edges, bridges: sent; how many of them were composed.
         components: connected components; as many as the same nodes have in the fleet map.
         size_bytes, of_bytes: of the file, and of the fleet map's.
-        why: facts of the policy, as plain data.
+        why: facts of the selection, as plain data.
         expected_missed, copy_missed: expected share of the mission's route without a match,
             with the nodes sent and with all nodes.
         forecast: interval of the first, by missions in other towns.
     """
 
     out: Path
-    policy: str
+    select: str
     revision: int
     source_hash: str
     content_hash: str
@@ -95,7 +95,7 @@ class DownloadReport:
         """The report as text."""
         share = self.nodes / self.of_nodes if self.of_nodes else 1.0
         lines = [
-            f"{self.policy}: {self.nodes} of {counted(self.of_nodes, 'node')} ({share:.1%}), "
+            f"{self.select}: {self.nodes} of {counted(self.of_nodes, 'node')} ({share:.1%}), "
             f"{self.size_bytes / 1e6:.1f} of {self.of_bytes / 1e6:.1f} MB, "
             f"of revision {self.revision}",
             f"{counted(self.sessions, 'session')}, {counted(self.edges, 'edge')} "
@@ -136,7 +136,7 @@ def download(
         monitor: receives progress per written node.
 
     Raises:
-        ConfigError: an option is missing, out of range, or not used by the policy.
+        ConfigError: an option is missing, out of range, or not used by the selection.
         InputError: no node fits the options, or `out` exists.
         MapError: the fleet map cannot be read, or `out` cannot be written.
 
@@ -150,7 +150,7 @@ def download(
         stock = Stock(store)
         if not len(stock):
             raise InputError(f"{store.location} holds no nodes at revision {store.revision}")
-        selection = SELECTIONS[options.policy](stock, options)
+        selection = SELECTIONS[options.select](stock, options)
         coverage = selection.coverage or coverage_for(stock, options)
         with draft_folder(out) as folder:
             part, why = choose_part(stock, selection, options, folder, monitor)
@@ -168,7 +168,7 @@ _DRAFT, _COMPACT = "draft.engram", "compact.engram"
 def choose_part(
     stock: Stock, selection: Selection, options: DownloadOptions, folder: Path, monitor: Monitor
 ) -> tuple[Part, Mapping[str, Any]]:
-    """The part of a selection, and facts of its policy; for a budget, as much as fits.
+    """The part of a selection, and facts of it; for a budget, as much as fits.
 
     A budget writes drafts into `folder` to measure them; the last one is the returned part.
     """
@@ -196,7 +196,7 @@ def choose_part(
 
 
 def _part(stock: Stock, selection: Selection, options: DownloadOptions) -> Part:
-    whole = options.policy == "copy"
+    whole = options.select == "copy"
     return Part.of(stock, selection.sent, whole=whole, thumbnails=options.with_thumbnails)
 
 
@@ -287,7 +287,7 @@ def revision_of(stock: Stock, options: DownloadOptions) -> dict[str, Any]:
     newest = stock.store.log()[-1]
     return {
         "author": "centre",
-        "message": f"download {options.policy} of revision {newest.number}",
+        "message": f"download {options.select} of revision {newest.number}",
         "configuration": {
             "download": {
                 **to_dict(options),
@@ -318,7 +318,7 @@ def _report(
     ).reshape(-1, 2)
     return DownloadReport(
         out=out,
-        policy=options.policy,
+        select=options.select,
         revision=stock.store.revision,
         source_hash=stock.content_hash,
         content_hash=content_hash,

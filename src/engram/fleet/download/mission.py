@@ -27,9 +27,9 @@ class DownloadOptions:
     """What to download; stored in the map that is sent.
 
     Attributes:
-        policy: key of `SELECTIONS`.
-        start_h, end_h: the mission's hours of day; None if not given.
-        day: the mission's date, "2026-11-17"; None for that of the fleet map's newest drive. It
+        select: key of `SELECTIONS`.
+        depart_h, arrive_h: the mission's hours of day; None if not given.
+        date: the mission's date, "2026-11-17"; None for that of the fleet map's newest drive. It
             gives the height of the sun at those hours.
         latitude_deg: where the fleet drives, north positive; None to estimate it from which
             sessions matched which nodes.
@@ -40,19 +40,19 @@ class DownloadOptions:
         buffer_min: widens the mission at both ends, minutes.
         budget_bytes: `budget`: largest size of the file.
         budget_percent: `budget`: the same, in per cent of a file with all nodes.
-        near: `region`, and any policy but `copy` and `route`: beginnings of UUIDs of nodes.
-        route: `route`, and any policy but `copy` and `region`: beginning of the UUID of a session
-            that drove it.
+        near: `region`, and any selection but `copy` and `route`: beginnings of UUIDs of nodes.
+        route: `route`, and any selection but `copy` and `region`: beginning of the UUID of a
+            session that drove it.
         radius_m: of regions and routes, along the edges, metres.
         widen_min: `tod`, `paths`: step by which an hour without data is widened, minutes.
         strict: whether an hour without data is refused instead.
-        thumbnails: whether thumbnails are sent; None for all policies but `budget`.
+        thumbnails: whether thumbnails are sent; None for all selections but `budget`.
     """
 
-    policy: str = "copy"
-    start_h: Annotated[float | None, Meta(ge=0, lt=24)] = None
-    end_h: Annotated[float | None, Meta(ge=0, lt=24)] = None
-    day: str | None = None
+    select: str = "copy"
+    depart_h: Annotated[float | None, Meta(ge=0, lt=24)] = None
+    arrive_h: Annotated[float | None, Meta(ge=0, lt=24)] = None
+    date: str | None = None
     latitude_deg: Annotated[float | None, Meta(ge=-90, le=90)] = None
     window_min: _Minutes = 180.0
     epoch_min: Annotated[float, Meta(ge=1, le=1440)] = 60.0
@@ -69,8 +69,8 @@ class DownloadOptions:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        if self.day is not None:
-            _check_day(self.day)
+        if self.date is not None:
+            _check_day(self.date)
         if self.budget_bytes is not None and self.budget_percent is not None:
             raise ConfigError(
                 f"budget is {self.budget_bytes} bytes and {self.budget_percent:g} per cent of "
@@ -80,7 +80,7 @@ class DownloadOptions:
     @property
     def with_thumbnails(self) -> bool:
         """Whether thumbnails are sent."""
-        return self.policy != "budget" if self.thumbnails is None else self.thumbnails
+        return self.select != "budget" if self.thumbnails is None else self.thumbnails
 
 
 def hour_from_text(text: str | None, name: str) -> float | None:

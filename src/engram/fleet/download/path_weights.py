@@ -96,8 +96,8 @@ def count_paths(
 
 def mission_epochs(
     counts: PathCounts,
-    start_h: float | None,
-    end_h: float | None,
+    depart_h: float | None,
+    arrive_h: float | None,
     buffer_min: float = 0.0,
 ) -> list[int]:
     """The epochs of a mission that have data. [G16] Algorithm 3, lines 1 to 6; method §7.
@@ -115,33 +115,33 @@ def mission_epochs(
             "no path has a node with a known hour of day: paths cannot be weighted by time; "
             "use --select copy, region or route"
         )
-    epochs = _between(start_h, end_h, buffer_min, counts.epoch_min, filled)
+    epochs = _between(depart_h, arrive_h, buffer_min, counts.epoch_min, filled)
     found = [epoch for epoch in epochs if epoch in set(filled.tolist())]
     if not found:
         raise InputError(
-            f"no epoch from {_told(start_h, 'first')} to {_told(end_h, 'last')} has data; there "
-            f"is some from {_spans(filled.tolist(), counts.epoch_min)}: choose other times, "
+            f"no epoch from {_told(depart_h, 'first')} to {_told(arrive_h, 'last')} has data; "
+            f"there is some from {_spans(filled.tolist(), counts.epoch_min)}: choose other times, "
             "or widen them with --set download.buffer_min=MINUTES"
         )
     return found
 
 
 def _between(
-    start_h: float | None,
-    end_h: float | None,
+    depart_h: float | None,
+    arrive_h: float | None,
     buffer_min: float,
     epoch_min: float,
     filled: NDArray[np.intp],
 ) -> list[int]:
     """The mission's epochs in the order of time."""
-    if start_h is not None and end_h is not None:
-        span_min = (end_h - start_h) * 60 % MINUTES_PER_DAY + 2 * buffer_min
-        start_min = (start_h * 60 - buffer_min) % MINUTES_PER_DAY
+    if depart_h is not None and arrive_h is not None:
+        span_min = (arrive_h - depart_h) * 60 % MINUTES_PER_DAY + 2 * buffer_min
+        start_min = (depart_h * 60 - buffer_min) % MINUTES_PER_DAY
         if start_min + span_min >= MINUTES_PER_DAY:
             return _over_midnight(start_min, span_min, epoch_min)
-        start_h, end_h, buffer_min = start_min / 60, (start_min + span_min) / 60, 0.0
-    start = _epoch_at(start_h, -buffer_min, epoch_min)
-    end = _epoch_at(end_h, buffer_min, epoch_min)
+        depart_h, arrive_h, buffer_min = start_min / 60, (start_min + span_min) / 60, 0.0
+    start = _epoch_at(depart_h, -buffer_min, epoch_min)
+    end = _epoch_at(arrive_h, buffer_min, epoch_min)
     first, last = int(filled[0]), int(filled[-1])
     begin = first if start is None or start < first else start
     stop = last if end is None or end > last else end

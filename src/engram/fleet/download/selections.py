@@ -28,9 +28,9 @@ class Selection:
 
     Attributes:
         sent: (N,) bool, which nodes of the stock are sent.
-        why: facts of the policy, as plain data.
+        why: facts of the selection, as plain data.
         order: for `budget`: (N,) nodes by gain, of which a first part is sent; else None.
-        coverage: the forecast that the policy used; else None.
+        coverage: the forecast that the selection used; else None.
     """
 
     sent: Mask
@@ -73,7 +73,7 @@ def select_tod_and_paths(stock: Stock, options: DownloadOptions) -> Selection:
 def select_region(stock: Stock, options: DownloadOptions) -> Selection:
     """Nodes within `radius_m` of some nodes, along the edges."""
     if not options.near:
-        raise ConfigError("policy region needs --near NODE, the beginning of a node's UUID")
+        raise ConfigError("selection region needs --near NODE, the beginning of a node's UUID")
     seeds = [stock.named_node(prefix) for prefix in options.near]
     return Selection(within(stock, np.array(seeds), options.radius_m), {"seeds": len(seeds)})
 
@@ -81,7 +81,9 @@ def select_region(stock: Stock, options: DownloadOptions) -> Selection:
 def select_route(stock: Stock, options: DownloadOptions) -> Selection:
     """Nodes within `radius_m` of the path of one session, along the edges."""
     if options.route is None:
-        raise ConfigError("policy route needs --route SESSION, the beginning of a session's UUID")
+        raise ConfigError(
+            "selection route needs --route SESSION, the beginning of a session's UUID"
+        )
     return Selection(along_route(stock, options.route, options.radius_m), {})
 
 
@@ -91,8 +93,8 @@ def select_budget(stock: Stock, options: DownloadOptions) -> Selection:
     How many of them fit into the budget is found when the map is written.
     """
     if options.budget_bytes is None and options.budget_percent is None:
-        raise ConfigError("policy budget needs --budget SIZE, such as 200MB or 25%")
-    if options.start_h is not None:
+        raise ConfigError("selection budget needs --budget SIZE, such as 200MB or 25%")
+    if options.depart_h is not None:
         stock.known_hours()
     coverage = coverage_for(stock, options)
     landmarks, thumbnails = stock.sizes
@@ -111,7 +113,7 @@ SELECTIONS: dict[str, Policy] = {
     "budget": select_budget,
 }
 
-# The options that each policy uses. All use the mission's time (for the forecast) and `thumbnails`.
+# The options that each selection uses; all use the mission's time (for the forecast), `thumbnails`.
 UNDERSTOOD: dict[str, frozenset[str]] = {
     "copy": frozenset(),
     "tod": frozenset({"near", "route", "strict"}),
@@ -124,34 +126,34 @@ UNDERSTOOD: dict[str, frozenset[str]] = {
 _FLAGS = {
     "budget_bytes": "--budget",
     "budget_percent": "--budget",
-    "near": "--near (--region)",
+    "near": "--near",
     "route": "--route",
     "strict": "--strict",
 }
-# Policies whose mission may have an end and no start: it starts with the first epoch with data.
+# Selections whose mission may have an end and no start: it starts with the first epoch with data.
 _OPEN_START = frozenset({"paths", "tod+paths"})
 
 
 def check_options(options: DownloadOptions) -> None:
-    """Refuses options that a policy would ignore.
+    """Refuses options that a selection would ignore.
 
     Raises:
-        ConfigError: the policy is unknown, does not use an option that was given, or lacks another
-            option that it needs with it.
+        ConfigError: the selection is unknown, does not use an option that was given, or lacks
+            another option that it needs with it.
     """
-    policy = options.policy
-    if policy not in SELECTIONS:
-        raise ConfigError(f"selection {policy!r} is unknown; known: {', '.join(SELECTIONS)}")
+    select = options.select
+    if select not in SELECTIONS:
+        raise ConfigError(f"selection {select!r} is unknown; known: {', '.join(SELECTIONS)}")
     for name, flag in _FLAGS.items():
-        if getattr(options, name) == _DEFAULTS[name] or name in UNDERSTOOD[policy]:
+        if getattr(options, name) == _DEFAULTS[name] or name in UNDERSTOOD[select]:
             continue
         *others, last = [one for one, understood in UNDERSTOOD.items() if name in understood]
         takers = f"{', '.join(others)} or {last}" if others else last
         raise ConfigError(
-            f"selection {policy} does not use {flag}; leave it out, or choose --select {takers}"
+            f"selection {select} does not use {flag}; leave it out, or choose --select {takers}"
         )
     _check_where(options)
-    if options.start_h is None:
+    if options.depart_h is None:
         _check_no_mission(options)
 
 
@@ -162,9 +164,9 @@ def _check_where(options: DownloadOptions) -> None:
 
 def _check_no_mission(options: DownloadOptions) -> None:
     """Refuses options about a mission's time if it has no start."""
-    if options.end_h is not None and options.policy not in _OPEN_START:
-        raise ConfigError(f"selection {options.policy} needs --depart with --arrive")
-    if options.day is not None:
+    if options.arrive_h is not None and options.select not in _OPEN_START:
+        raise ConfigError(f"selection {options.select} needs --depart with --arrive")
+    if options.date is not None:
         raise ConfigError("--date gives the height of the sun at --depart; give both")
 
 
@@ -228,8 +230,8 @@ def _nodes_on(stock: Stock, paths: list[PathId]) -> Mask:
 
 def _spare_order(stock: Stock, options: DownloadOptions) -> NDArray[np.int64]:
     """All nodes, those nearest in time of day first: they fill the rest of a budget."""
-    if options.start_h is None:
+    if options.depart_h is None:
         return np.arange(len(stock))
-    apart = np.abs(stock.hours - options.start_h)
+    apart = np.abs(stock.hours - options.depart_h)
     apart = np.nan_to_num(np.minimum(apart, _HOURS - apart), nan=_HOURS)
     return np.argsort(apart, kind="stable")

@@ -40,7 +40,7 @@ class UpdateReport:
 
     Attributes:
         out: the robot's map.
-        policy: key of `SELECTIONS`.
+        select: key of `SELECTIONS`.
         source_revision: of the fleet map.
         revision: the new one of the robot's map; None if it lacked nothing.
         content_hash: of the robot's map.
@@ -48,11 +48,11 @@ class UpdateReport:
         own_nodes: nodes of the robot's map that the download does not have.
         sessions, edges, path_entries, attempts: copied.
         ties: new edges between own nodes and the nodes by which the fleet map replaced them.
-        why: facts of the policy, as plain data.
+        why: facts of the selection, as plain data.
     """
 
     out: Path
-    policy: str
+    select: str
     source_revision: int
     revision: int | None
     content_hash: str
@@ -73,7 +73,7 @@ class UpdateReport:
 
     def text(self) -> str:
         """The report as text."""
-        head = f"{self.policy} of revision {self.source_revision}: {counted(self.of_nodes, 'node')}"
+        head = f"{self.select} of revision {self.source_revision}: {counted(self.of_nodes, 'node')}"
         if self.revision is None:
             lines = [f"{head}; {self.out.name} has them all: nothing changed"]
         else:
@@ -107,7 +107,7 @@ def update(
         message: of the revision; None names the download.
 
     Raises:
-        ConfigError: an option is missing, out of range, or not used by the policy.
+        ConfigError: an option is missing, out of range, or not used by the selection.
         InputError: no node fits the options, or both maps are the same file.
         IncompatibleError: the maps have different kinds of descriptors, or hold a session or a node
             of one UUID with different content.
@@ -124,13 +124,13 @@ def update(
         stock = Stock(store)
         if not len(stock):
             raise InputError(f"{store.location} holds no nodes at revision {store.revision}")
-        selection = SELECTIONS[options.policy](stock, options)
+        selection = SELECTIONS[options.select](stock, options)
         with draft_folder(robot) as folder:
             part, why = choose_part(stock, selection, options, folder, monitor)
         taking = _Update(part, own)
         about = revision_of(stock, options)
         revision = taking.write({**about, "message": message or about["message"]}, monitor)
-        return taking.report(robot, options.policy, revision, dict(why))
+        return taking.report(robot, options.select, revision, dict(why))
 
 
 class _Update:
@@ -147,11 +147,11 @@ class _Update:
         _check_fits(part, own, self._own)
 
     def report(
-        self, out: Path, policy: str, revision: int | None, why: dict[str, Any]
+        self, out: Path, select: str, revision: int | None, why: dict[str, Any]
     ) -> UpdateReport:
         return UpdateReport(
             out=out,
-            policy=policy,
+            select=select,
             source_revision=self._stock.store.revision,
             revision=revision,
             content_hash=self._map.content_hash(),

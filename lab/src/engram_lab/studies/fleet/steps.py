@@ -168,7 +168,7 @@ def download_for_foray(
     with Map.open(draft) as store:
         sent = {node.id for node in store.load().nodes}
     made = DownloadRecord(
-        report.policy, hour, report.nodes, report.of_nodes, len(mine | sent), report.size_bytes,
+        report.select, hour, report.nodes, report.of_nodes, len(mine | sent), report.size_bytes,
         report.of_bytes, newest_in_force(draft),
     )  # fmt: skip
     write_record(record, made)
@@ -181,7 +181,7 @@ def _downloaded(
     """What a robot gets: where nothing was driven at such an hour it asks for more."""
     try:
         strict = policy in _ASKS_FOR_MORE
-        options = asked.options(policy, start_h=hour, end_h=hour, strict=strict)
+        options = asked.options(policy, depart_h=hour, arrive_h=hour, strict=strict)
         return download(whole, draft, options)
     except InputError:
         if policy not in _ASKS_FOR_MORE:
