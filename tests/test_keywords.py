@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 
 import pytest
-from tests.worlds import CAMERA
+from tests.synthetic_world import CAMERA
 
 import engram
+from engram.cli.options import Drive, Effort
 from engram.keywords import keywords
 from engram.maps import Map
+from engram.robot import RobotOptions
 
 PUBLIC = {
     "open_drive": engram.open_drive,
@@ -50,6 +53,17 @@ def test_a_robot_is_given_a_ranking_not_a_policy(tmp_path):
         pytest.raises(engram.EngramError, match="did you mean ranking"),
     ):
         opened.robot(CAMERA, policy="path")
+
+
+@pytest.mark.parametrize(
+    ("options", "function"),
+    [(Drive, engram.open_drive), (Effort, Map.robot), (Effort, RobotOptions)],
+)
+def test_python_takes_the_words_of_the_command_line(options, function):
+    """A unit may follow: the command line's help states it."""
+    taken = inspect.signature(function).parameters
+    for one in dataclasses.fields(options):
+        assert {one.name, f"{one.name}_deg"} & taken.keys()
 
 
 def test_what_a_function_takes_reaches_it_unchanged():

@@ -119,13 +119,14 @@ def test_a_verb_that_moved_answers_with_its_new_name(engram, old: str) -> None:
     [(verb, old) for table in (moved.OPTIONS, moved.GONE) for verb in table for old in table[verb]],
 )
 def test_an_option_that_moved_answers_with_its_new_name(engram, verb: str, old: str) -> None:
-    ran = engram(verb, "a.engram", "b", old, "1", "--json")
+    words = tuple(verb.split())
+    ran = engram(*words, "a.engram", "b", "c", old, "1", "--json")
     assert ran.status == 2
     answer = moved.moved_option(verb, old)
     assert answer is not None
     assert ran.json["error"]["message"] == answer
     new = moved.OPTIONS.get(verb, {}).get(old, "").split("=")[0].split()
-    taken = {option for one in COMMANDS[verb].params for option in one.opts}
+    taken = {option for one in command_of(words).params for option in one.opts}
     assert not new or new[0] in taken
 
 

@@ -159,7 +159,7 @@ def test_nothing_to_seal(engram, town: Path) -> None:
 
 def test_a_teblid_map_is_localised_in_with_teblid(engram, street: Path, tmp_path: Path) -> None:
     path = tmp_path / "teblid.engram"
-    assert engram("map", path, street, "--descriptor", "teblid").status == 0
+    assert engram("map", path, street, "--features", "teblid").status == 0
     assert engram("info", path, "--json").json["descriptor"] == "teblid"
     found = engram("localise", path, street, "--json").json
     assert found["summary"]["share_localised"] == 1.0
@@ -167,7 +167,7 @@ def test_a_teblid_map_is_localised_in_with_teblid(engram, street: Path, tmp_path
 
 def test_two_kinds_of_descriptor_do_not_mix(engram, street: Path, town: Path, tmp_path) -> None:
     log = tmp_path / "teblid.framelog"
-    assert engram("record", street, log, "--descriptor", "teblid").status == 0
+    assert engram("record", street, log, "--features", "teblid").status == 0
     for verb in ("localise", "map"):
         ran = engram(verb, town, log, "--robot", "r2", "--json")
         assert ran.status == 2
@@ -180,15 +180,15 @@ def test_a_kind_of_descriptor_that_is_insisted_on_is_not_passed_over(
 ) -> None:
     log, new = tmp_path / "brief.framelog", tmp_path / "new.engram"
     assert engram("record", street, log).status == 0
-    ran = engram("map", new, log, "--descriptor", "teblid")
+    ran = engram("map", new, log, "--features", "teblid")
     assert ran.status == 2
     assert "has brief features, not teblid" in ran.err
     assert "record it again with --features teblid" in ran.err
     assert not new.exists()
-    ran = engram("map", town, street, "--robot", "r2", "--descriptor", "teblid", "--json")
+    ran = engram("map", town, street, "--robot", "r2", "--features", "teblid", "--json")
     assert ran.json["error"]["kind"] == "ConfigError"
     assert "map the drive into another map" in ran.json["error"]["message"]
-    assert engram("map", new, log, "--descriptor", "brief").status == 0
+    assert engram("map", new, log, "--features", "brief").status == 0
 
 
 def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Path) -> None:
@@ -216,7 +216,7 @@ def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Pa
         (("map", "TOWN", "STREET", "--longitude", 400), "400"),
         (("record", "STREET", "no/such/folder/a.framelog"), "no/such/folder"),
         (("info", "STREET"), "street"),
-        (("map", "TOWN", "STREET", "--descriptor", "sift"), "sift"),
+        (("map", "TOWN", "STREET", "--features", "sift"), "sift"),
     ],
 )
 def test_bad_input_is_one_clear_line_and_status_two(

@@ -144,7 +144,7 @@ def test_a_vocabulary_of_another_descriptor_is_refused(
     engram, street: Path, town: Path, tmp_path: Path
 ) -> None:
     other = tmp_path / "teblid.engram"
-    assert engram("map", other, street, "--descriptor", "teblid").status == 0
+    assert engram("map", other, street, "--features", "teblid").status == 0
     assert engram("vocabulary", "train", other, "--words", 100).status == 0
     ran = engram("vocabulary", "use", town, other)
     assert ran.status != 0
