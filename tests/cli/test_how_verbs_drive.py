@@ -62,7 +62,7 @@ def test_the_settings_rank_and_attempt_unless_options_do(
 
     monkeypatch.setattr(called, spied)
     monkeypatch.setattr("engram_lab.trial.check_not_sent", lambda *_: None)
-    monkeypatch.setattr("engram.viewing.viewer.Viewer", lambda _: _Nothing())
+    monkeypatch.setattr("engram.viewing.viewer.Viewer", lambda *_: _Nothing())
     words = [{"m.engram": a_map, "c.engram": tmp_path / "c.engram", "DRIVE": street}.get(one, one)
              for one in typed.split()]  # fmt: skip
     for config in ("linegar2015", "gadd2016"):

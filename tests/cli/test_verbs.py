@@ -318,7 +318,7 @@ def test_ctrl_c_before_there_is_a_result_is_said_in_json_too(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("engram.robot.open_drive", interrupted)
+    monkeypatch.setattr("engram.sequences.opening.open_with", interrupted)
     ran = engram("localise", town, street, "--json")
     assert ran.status == 130
     assert "interrupted" in ran.json["error"]["message"]
