@@ -11,7 +11,7 @@ import os
 import re
 import sqlite3
 import stat
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,11 +70,12 @@ class FileKind:
     Attributes:
         noun: its name in messages.
         application_id: number in the file's header that identifies the kind.
-        format_version: the newest known format.
-        metadata: its tables, in the newest format.
+        format_version: the one that is read.
+        metadata: its tables.
         strange: the error for a file that is not of this kind, or cannot be opened.
         cure: advice for a damaged file.
         busy_s: how long to wait for another process to release the file, seconds.
+        older: advice for a file of an earlier format.
     """
 
     noun: str
@@ -84,6 +85,7 @@ class FileKind:
     strange: type[EngramError]
     cure: str
     busy_s: float
+    older: str = ""
 
 
 class SqliteFile:
@@ -134,12 +136,14 @@ class SqliteFile:
         if not os.access(self.path.parent, os.W_OK):
             raise MapError(f"{self.path} cannot be created: permission denied")
 
-    def identify(self, execute: Execute) -> int:
-        """Format of the file, read through SQLite, since the log may be newer than the first page.
+    def identify(self, execute: Execute) -> None:
+        """Refuses files of another kind or format.
+
+        Read through SQLite, since the log may be newer than the first page.
 
         Raises:
             EngramError: the kind's `strange`: a file of another kind.
-            FormatVersionError: written by a newer Engram.
+            FormatVersionError: written by an Engram that is newer, or much older.
             MapCorruptError: the format does not exist.
         """
         kind = self.kind
@@ -153,7 +157,11 @@ class SqliteFile:
             )
         if version < 1:
             raise MapCorruptError(f"{self.path}: format {version} does not exist; {kind.cure}")
-        return version
+        if version < kind.format_version:
+            raise FormatVersionError(
+                f"{self.path} is a {kind.noun} of format {version}, this Engram ({__version__}) "
+                f"reads format {kind.format_version} alone: {kind.older}"
+            )
 
     def is_new(self, execute: Execute) -> bool:
         """Whether the file is still empty."""
@@ -165,15 +173,14 @@ class SqliteFile:
         execute(f"PRAGMA application_id={self.kind.application_id}")
         execute(f"PRAGMA user_version={self.kind.format_version}")
 
-    def check_tables(self, execute: Execute, missing: Collection[str] = ()) -> None:
+    def check_tables(self, execute: Execute) -> None:
         """Refuses files with other tables or columns, or with anything that SQLite would evaluate.
 
         Definitions are compared as text, before any table is touched: defaults, checks, generated
         columns, partial indices, views, triggers and virtual tables of a stranger never run.
 
         Args:
-            execute: `execute` of an open connection; temporary tables may replace missing ones.
-            missing: tables that the file's format lacks.
+            execute: `execute` of an open connection.
 
         Raises:
             MapCorruptError: other tables, or other columns.
@@ -184,10 +191,9 @@ class SqliteFile:
                     f"{self.path}: {str(name)!r:.60} is not a plain table or index; "
                     f"{self.kind.cure}"
                 )
-        expected = self.kind.metadata.tables.keys() - set(missing)
         found = execute("SELECT type, name FROM sqlite_schema WHERE type != 'index'").fetchall()
         here = {(str(kind), str(name)) for kind, name in found}
-        wanted = {("table", name) for name in expected}
+        wanted = {("table", name) for name in self.kind.metadata.tables}
         if here != wanted:
             raise MapCorruptError(
                 f"{self.path}: not the tables of its format: missing {sorted(wanted - here)}, "

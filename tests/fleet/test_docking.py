@@ -43,7 +43,6 @@ from engram.robot import RobotOptions, Settings, map_drive, measure, open_drive,
 from .robots import frame_log, merged, rewritten, robot_map
 
 HOUR_NS = 3_600_000_000_000
-OLDER_FORMAT = Path(__file__).parents[1] / "maps" / "data" / "format-2.engram"
 WELL = Drive(np.ones(40), np.ones(40, np.bool_))
 BADLY = Drive(np.ones(40), np.zeros(40, np.bool_))
 
@@ -218,13 +217,6 @@ class TestRefused:
             connection.execute("UPDATE edges SET a_from_b = zeroblob(96) WHERE key = 2")
         connection.close()
         self.refuses(centre, robot, MapCorruptError, f"{robot}: table edges")
-
-    def test_a_map_that_does_not_fit_a_centre_of_an_older_format(self, tmp_path, fleet):
-        centre = tmp_path / "centre.engram"
-        shutil.copy(OLDER_FORMAT, centre)
-        robot = rewritten(fleet["other"][0], tmp_path / "t.engram", descriptor=TEBLID)
-        self.refuses(centre, robot, IncompatibleError, "teblid", "brief")
-        self.refuses(centre, damaged(fleet["other"][0], tmp_path / "d.engram"), MapError)
 
 
 class TestNothingIsMade:

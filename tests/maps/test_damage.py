@@ -18,7 +18,6 @@ from sqlalchemy import Table
 
 from engram.errors import (
     EngramError,
-    FormatVersionError,
     InputError,
     MapCorruptError,
     MapError,
@@ -29,7 +28,7 @@ from engram.errors import (
 from engram.graph.model import path_id
 from engram.maps import Map, check_file
 from engram.maps.rows import sealed
-from engram.maps.schema import FORMAT_VERSION, edges, nodes, path_entries
+from engram.maps.schema import edges, nodes, path_entries
 from engram.sqlite import SqliteFile
 
 from .frames import assert_same_landmarks
@@ -143,16 +142,6 @@ def test_each_wrong_file_gets_its_own_error(tmp_path, broken):
         for opener in (Map.open, partial(Map.open, writes=True), check_file):
             with pytest.raises(NotAMapError, match=fact):
                 opener(path)
-
-
-def test_a_newer_format_is_named(broken):
-    with sqlite3.connect(broken) as connection:
-        connection.execute(f"PRAGMA user_version={FORMAT_VERSION + 1}")
-    connection.close()
-    told = rf"format {FORMAT_VERSION + 1}.*up to {FORMAT_VERSION}"
-    for opener in (Map.open, partial(Map.open, writes=True), check_file):
-        with pytest.raises(FormatVersionError, match=told):
-            opener(broken)
 
 
 @pytest.mark.parametrize(

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
-from pathlib import Path
 
 import pytest
 
 from engram.errors import InputError, RevisionError
 from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, path_id
 from engram.maps import Map, SessionState, check_file
-from engram.maps.schema import FORMAT_VERSION
 
 from .frames import assert_same_landmarks
 from .maps import Drive, assert_same_edges, begin, edge, node_frame, session, write_drive
 from .test_map_store import assert_holds
-
-OLD = Path(__file__).parent / "data" / "format-1.engram"
 
 
 @pytest.fixture
@@ -287,20 +282,3 @@ class TestBlame:
     def test_what_is_no_uuid_is_refused(self, store, two, prefix):
         with pytest.raises(InputError, match="is not a UUID"):
             store.origin(prefix)
-
-
-def test_an_old_map_is_raised_when_it_is_written_and_reads_the_same(tmp_path):
-    old = shutil.copy(OLD, tmp_path / "old.engram")
-    with Map.open(old) as reader:
-        assert reader.info().format_version == 1
-        assert reader.tags() == {}
-        before = reader.content_hash()
-        with Map.open(old, writes=True) as writer:
-            assert writer.content_hash() == before
-            assert writer.info().format_version == FORMAT_VERSION
-            writer.tag("first", 1, author="me")
-            # Who had opened the file before goes on reading.
-            assert reader.content_hash() == before
-        with Map.open(old, at="first") as other:
-            assert other.revision == 1
-    assert check_file(old).problems == ()

@@ -117,16 +117,3 @@ def test_only_nodes_of_the_map_have_words(path: Path) -> None:
     map_with_words(path)
     with Map.open(path, writes=True) as store, pytest.raises(InputError, match="not in the"):
         store.put_words(ONE, {NodeId(session("x").id): words_of(1)})
-
-
-def test_a_map_of_format_1_has_none_until_somebody_writes_them(tmp_path: Path) -> None:
-    old = tmp_path / "old.engram"
-    old.write_bytes((Path(__file__).parent / "data" / "format-1.engram").read_bytes())
-    with Map.open(old) as store:
-        assert store.words(ONE) == {}
-        node = store.load().nodes[0].id
-    with Map.open(old, writes=True) as store:
-        store.put_words(ONE, {node: words_of(4)})
-    with Map.open(old) as store:
-        assert list(store.words(ONE)) == [node]
-    assert check_file(old).problems == ()

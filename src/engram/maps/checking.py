@@ -39,7 +39,7 @@ from engram.maps.rows import (
     verified,
 )
 from engram.maps.schema import (
-    NEWER,
+    FORMAT_VERSION,
     VERSIONED,
     amendments,
     attempts,
@@ -51,7 +51,6 @@ from engram.maps.schema import (
     hidden,
     map_format,
     metadata,
-    missing_in,
     nodes,
     omissions,
     omitted_landmarks,
@@ -71,7 +70,6 @@ from engram.maps.sqlite import SqliteDatabase
 from engram.maps.tally import check_tally
 from engram.maps.words import decode_words
 
-_LATER = {table for news in NEWER.values() for table in news}
 # The table that a column refers to.
 _REFERENCES = {
     "session": sessions,
@@ -222,8 +220,7 @@ class _Checking:
         self._check_history()
         if len(self.revision_of[map_format]) != 1:
             self.report(map_format, "", "must have one row")
-        if tag_tally not in missing_in(self.database.format_version):
-            self._check_tally()
+        self._check_tally()
 
     def _check_tally(self) -> None:
         try:
@@ -250,8 +247,7 @@ class _Checking:
                 continue
             for table in (one for one in VERSIONED if not (self.thin and one is frames)):
                 found = self.brought[row["key"], table.name]
-                # Earlier formats lacked the table.
-                brought = contents.get(table.name, 0 if table in _LATER else None)
+                brought = contents.get(table.name, 0)
                 if brought != found:
                     self.report(
                         table, "", f"revision {name} added {brought} rows, but {found} are stored"
@@ -285,10 +281,9 @@ class _Checking:
         )
 
 
-def _check_format(checking: _Checking, row: Row) -> None:
-    expected = checking.database.format_version
-    if row["version"] != expected:
-        raise MapCorruptError(f"says format {row['version']}, the file says {expected}")
+def _check_format(_: _Checking, row: Row) -> None:
+    if row["version"] != FORMAT_VERSION:
+        raise MapCorruptError(f"says format {row['version']}, the file says {FORMAT_VERSION}")
 
 
 def _check_revision(checking: _Checking, row: Row) -> None:

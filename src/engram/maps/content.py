@@ -17,7 +17,6 @@ from engram.maps.attempts import COLUMNS, unpack
 from engram.maps.reading import load_cameras, load_frontends
 from engram.maps.rows import Row, verified, verified_values
 from engram.maps.schema import (
-    NEWER,
     VERSIONED,
     attempts,
     frames,
@@ -47,8 +46,8 @@ _REFERENCES = {
 # since they follow from the rest to the rounding of a linear solver.
 _HASHED = tuple(table for table in VERSIONED if table not in {frames, placements})
 _LEFT_OUT = {"key", "checksum"}
-# Tables left out if empty, so that a map has the same hash in every format.
-_IF_ANY = {str(table.name) for news in NEWER.values() for table in news}
+# Tables that count only if they hold rows.
+_IF_ANY = {"amendments", "anchors", "goals", "omitted_landmarks", "removals"}
 
 Identities = dict[str, dict[int, Any]]
 

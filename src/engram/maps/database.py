@@ -1,19 +1,18 @@
-"""Errors about damaged rows, rows that replace others, and the upgrade of older formats."""
+"""Errors about damaged rows, rows that replace others, and the rows that every map has."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from sqlalchemy import Connection, Table, delete, insert, text
+from sqlalchemy import Connection, Table, delete, insert
 from sqlalchemy.dialects.sqlite import Insert
 from sqlalchemy.exc import NoResultFound
-from sqlalchemy.schema import CreateTable
 
 from engram import __version__
 from engram.errors import EngramError, MapCorruptError
 from engram.maps.rows import sealed
-from engram.maps.schema import FORMAT_VERSION, map_format, missing_in, rebuilt_from
+from engram.maps.schema import FORMAT_VERSION, map_format
 from engram.maps.tally import count_tags
 
 _STUMBLES = (TypeError, ValueError, LookupError, ArithmeticError, NoResultFound)
@@ -71,25 +70,6 @@ def upsert(table: Table, key: tuple[str, ...]) -> Insert:
     statement = Insert(table)
     rest = {one.name: one for one in statement.excluded if one.name not in key}
     return statement.on_conflict_do_update(index_elements=list(key), set_=rest)
-
-
-def raise_tables(connection: Connection, version: int) -> None:
-    """Creates new tables, copies those whose constraints changed, and writes the format.
-
-    Args:
-        connection: in a transaction, which makes the upgrade atomic.
-        version: the format of the map so far.
-    """
-    for table in missing_in(version):
-        connection.execute(CreateTable(table))
-    for table in rebuilt_from(version):
-        connection.execute(text(f"ALTER TABLE {table.name} RENAME TO older"))
-        connection.execute(CreateTable(table))
-        columns = ", ".join(table.columns.keys())
-        copied = f"INSERT INTO {table.name} ({columns}) SELECT {columns} FROM older ORDER BY key"
-        connection.execute(text(copied))
-        connection.execute(text("DROP TABLE older"))
-    write_format(connection)
 
 
 def write_format(connection: Connection) -> None:

@@ -156,11 +156,6 @@ class MapReader:
         return self._view.at
 
     @property
-    def format_version(self) -> int:
-        """Version of the map's stored format."""
-        return self._database.format_version
-
-    @property
     def graph(self) -> ExperienceGraph:
         """Its experience graph."""
         return self._read_contents().graph
@@ -355,7 +350,6 @@ class MapReader:
             return reading.info(
                 connection,
                 self._view,
-                format_version=self._database.format_version,
                 size_bytes=self._database.size_bytes(),
             )
 

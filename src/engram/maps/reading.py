@@ -193,7 +193,7 @@ def revision_from_row(row: Row) -> Revision:
     )
 
 
-def info(connection: Connection, view: View, *, format_version: int, size_bytes: int) -> MapInfo:
+def info(connection: Connection, view: View, *, size_bytes: int) -> MapInfo:
     """Counts and sizes of the map, without reading all records."""
     by_kind = dict.fromkeys(EdgeKind, 0)
     mapped_m = 0.0
@@ -210,7 +210,6 @@ def info(connection: Connection, view: View, *, format_version: int, size_bytes:
     )
     counted = view.select(attempts).with_only_columns(func.sum(attempts.c.count)).order_by(None)
     return MapInfo(
-        format_version=format_version,
         revision=view.at,
         descriptor=descriptor_of(connection, view),
         cameras=connection.execute(select(func.count()).select_from(used.subquery())).scalar_one(),

@@ -186,7 +186,6 @@ class MapInfo:
     """Counts and sizes of a map.
 
     Attributes:
-        format_version: version of the file's format.
         revision: number of the newest visible revision; 0 for an empty map.
         descriptor: kind of all descriptors; None before the first session.
         cameras, sessions, nodes, edges, path_entries, attempts: number of visible ones.
@@ -195,7 +194,6 @@ class MapInfo:
         size_bytes: size of the file with its write-ahead log, or of the tables.
     """
 
-    format_version: int
     revision: int
     descriptor: DescriptorKind | None
     cameras: int

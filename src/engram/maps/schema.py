@@ -170,7 +170,7 @@ path_entries = _table(
     _int("node"),
     _text("kind"),
     _int("stamp_ns"),
-    UniqueConstraint("path", "sequence", "revision"),  # format 1: path, sequence
+    UniqueConstraint("path", "sequence", "revision"),
 )
 
 omissions = _table(
@@ -180,7 +180,7 @@ omissions = _table(
     _int("revision"),
     _int("node", "its equivalent"),
     _bytes("node_from_omitted", "transform"),
-    UniqueConstraint("uuid", "revision"),  # format 1: uuid
+    UniqueConstraint("uuid", "revision"),
 )
 
 # Hashes of the landmarks of omitted nodes: a node with the same UUID must have the same landmarks.
@@ -337,25 +337,3 @@ VERSIONED: tuple[Table, ...] = (
     hidden,
 )
 KEYED: tuple[Table, ...] = tuple(table for table in metadata.sorted_tables if "key" in table.c)
-
-# Tables by the format that introduced them; all others are of format 1. In a map of an older format
-# they read as empty.
-NEWER: dict[int, tuple[Table, ...]] = {
-    2: (tags, words),
-    3: (omitted_landmarks,),
-    4: (amendments,),
-    5: (removals, placements, anchors, goals),
-    6: (tag_tally,),
-}
-# Tables with the columns of format 1 whose constraints a later format loosened.
-LOOSENED: dict[int, tuple[Table, ...]] = {2: (path_entries, omissions)}
-
-
-def missing_in(version: int) -> list[Table]:
-    """The tables that a map of an older format does not have."""
-    return [table for since, news in NEWER.items() if since > version for table in news]
-
-
-def rebuilt_from(version: int) -> list[Table]:
-    """The tables that a map of an older format has with stricter constraints."""
-    return [table for since, news in LOOSENED.items() if since > version for table in news]

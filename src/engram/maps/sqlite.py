@@ -16,20 +16,13 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, Select, Table, event
-from sqlalchemy.dialects import sqlite as sqlite_dialect
-from sqlalchemy.schema import CreateTable
+from sqlalchemy import Connection, Engine, Select, event
 from sqlalchemy.sql.compiler import SQLCompiler
 
 from engram.errors import MapCorruptError, MapError, NotAMapError, StorageFullError
 from engram.files import Holder, WriterLock, current_holder, naming, new_file, publish
-from engram.maps.database import (
-    damage_named,
-    raise_tables,
-    reading_rows,
-    write_format,
-)
-from engram.maps.schema import FORMAT_VERSION, metadata, missing_in
+from engram.maps.database import damage_named, reading_rows, write_format
+from engram.maps.schema import FORMAT_VERSION, metadata
 from engram.sqlite import FileKind, SqliteFile
 
 MAP_FILE = FileKind(
@@ -39,6 +32,7 @@ MAP_FILE = FileKind(
     metadata=metadata,
     strange=NotAMapError,
     cure="run engram check, and restore a copy",
+    older="map its drives again",
     busy_s=30.0,  # seconds; writers lock the file only for a checkpoint
 )
 # SQLite then takes no locks, and does not notice writes of other processes.
@@ -47,14 +41,14 @@ _BESIDE = ("-wal", "-shm", "-journal")
 
 
 class SqliteDatabase:
-    """One map file. Opening it checks that it is a map of a known format.
+    """One map file. Opening it checks that it is a map of the current format.
 
     Args:
         path: the file.
 
     Raises:
         NotAMapError: the file does not exist or is not a map.
-        FormatVersionError: written by a newer Engram.
+        FormatVersionError: written by an Engram that is newer, or much older.
         MapCorruptError: its tables are not those of its format.
         MapError: it cannot be read.
     """
@@ -63,17 +57,16 @@ class SqliteDatabase:
         self.path = path.resolve()  # one lock per map, even through links
         self._file = SqliteFile(self.path, MAP_FILE)
         self._file.check_regular()
-        self._options, self.format_version = self._way_of_reading()
+        self._options = self._way_of_reading()
         nobody_writes = self._options == _NOBODY_WRITES
         self._as_opened = _state(self.path) if nobody_writes else None
-        self._reader = self._file.engine(self._options, self._prepare_reader)
+        self._reader = self._file.engine(self._options, _prepare_reader)
         self._writer: Engine | None = None
         self._closed = False
         self._compiled: dict[Select[Any], tuple[str, tuple[str, ...]]] = {}
         self._idle: deque[sqlite3.Connection] = deque()  # one for each concurrent thread
-        missing = {table.name for table in missing_in(self.format_version)}
         with self.reading() as connection:
-            self._file.check_tables(connection.exec_driver_sql, missing)
+            self._file.check_tables(connection.exec_driver_sql)
 
     @staticmethod
     def create(path: Path) -> None:
@@ -151,7 +144,7 @@ class SqliteDatabase:
                 connection = self._idle.pop()
             except IndexError:
                 connection = self._file.connect(self._options)
-                self._prepare_reader(connection)
+                _prepare_reader(connection)
             try:
                 row: tuple[Any, ...] | None = connection.execute(
                     statement, [parameters[name] for name in names]
@@ -174,13 +167,7 @@ class SqliteDatabase:
         self.check_open()
         if not os.access(self.path, os.W_OK):
             raise MapError(f"{self.path} is read-only; copy it to a writable folder")
-        lock = WriterLock(self.path)
-        try:
-            self._raise_format()
-        except BaseException:
-            lock.release()
-            raise
-        return lock
+        return WriterLock(self.path)
 
     def writer(self) -> Holder | None:
         """The current writer; None without one."""
@@ -261,46 +248,30 @@ class SqliteDatabase:
         while self._idle:
             self._idle.pop().close()
 
-    def _way_of_reading(self) -> tuple[str, int]:
-        """The way to open the file for reading, and its format.
+    def _way_of_reading(self) -> str:
+        """The way to open the file for reading.
 
         A write-ahead log needs a second file, which cannot be created on read-only media or a full
         disk. Without a log and a writer, SQLite can open the file as immutable instead.
         """
         if os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK):
             try:
-                return "mode=rw", self._format_version("mode=rw")
+                self._identify("mode=rw")
+                return "mode=rw"
             except StorageFullError:
                 if _has_log(self.path) or current_holder(self.path) is not None:
                     raise
         options = "mode=ro" if _has_log(self.path) else _NOBODY_WRITES
-        return options, self._format_version(options)
+        self._identify(options)
+        return options
 
-    def _format_version(self, options: str) -> int:
+    def _identify(self, options: str) -> None:
         with self._file.errors(), closing(self._file.connect(options)) as connection:
-            return self._file.identify(connection.execute)
-
-    def _prepare_reader(self, connection: sqlite3.Connection) -> None:
-        """Adds tables that an older format lacks as empty temporary tables of this connection."""
-        for table in missing_in(self.format_version):
-            connection.execute(_definition(table).replace("CREATE TABLE", "CREATE TEMP TABLE", 1))
-        connection.execute("PRAGMA query_only=ON")
-
-    def _raise_format(self) -> None:
-        """Upgrades an older map to the newest format in one transaction."""
-        if self._format_version("mode=rw") < FORMAT_VERSION:
-            with self.writing() as connection:
-                raise_tables(connection, self.format_version)
-                self._file.mark(connection.exec_driver_sql)
-        if self.format_version < FORMAT_VERSION:
-            self.format_version = FORMAT_VERSION
-            self._end_readers()
-            self._reader = self._file.engine(self._options, self._prepare_reader)
+            self._file.identify(connection.execute)
 
 
-def _definition(table: Table) -> str:
-    """The statement that makes a table."""
-    return str(CreateTable(table).compile(dialect=sqlite_dialect.dialect())).strip()
+def _prepare_reader(connection: sqlite3.Connection) -> None:
+    connection.execute("PRAGMA query_only=ON")
 
 
 def _log(path: Path) -> Path:
@@ -322,7 +293,7 @@ def _state(path: Path) -> tuple[int, int, int] | None:
 
 def _writing_engine(file: SqliteFile, options: str) -> Engine:
     engine = file.engine(options)
-    # Takes the write lock at once: a transaction that upgrades later can fail half way.
+    # Takes the write lock at once: a transaction that asks for it later can fail half way.
     event.listen(engine, "begin", lambda one: one.exec_driver_sql("BEGIN IMMEDIATE"))
     return engine
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from engram.graph.clock import hour_of_day, zone_note
 from engram.graph.model import Amendable, path_id
-from engram.maps import Map, check_file
+from engram.maps import FORMAT_VERSION, Map, check_file
 from engram.maps.history import stamp_text
 from engram.places.words import vocabulary_problems
 
@@ -24,7 +24,7 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
         info = store.info()
         components = Counter(store.graph.components().tolist())
         return {
-            "format_version": info.format_version,
+            "format_version": FORMAT_VERSION,
             "revision": info.revision,
             "content_hash": store.content_hash(),
             "descriptor": info.descriptor,

@@ -1,30 +1,68 @@
-"""Writes `format-6.engram`: run once, when the format came to be. Never run it again.
+"""Writes `format-6.engram`. Run it only while format 6 is the newest.
 
     python -m tests.maps.data.make_format_6 FILE
 
-What format 5 could not hold: the tally of its tags.
+One map with a row of every kind: two drives, the second reverted and mapped again, one that was
+interrupted, a superseded edge, an omission, an amendment, marks, words and tags.
 """
 
 from __future__ import annotations
 
 import socket
 import sys
+from pathlib import Path
+from uuid import UUID
 
-from tests.maps.maps import begin, session, write_drive
+import numpy as np
+from tests.maps.maps import begin, edge, session, write_drive
 
+from engram.geometry import SE3
+from engram.graph.marks import Anchor, Goal, Placement, Removal
+from engram.graph.model import Amendable, EdgeKind, NodeId, Omission
 from engram.maps import Map
 
+OMITTED = NodeId(UUID(int=3))
+AUTHOR = "tests"
 
-def main(path: str) -> None:
-    socket.gethostname = lambda: "example"
+
+def write_map(path: Path | str) -> None:
+    """The map; the same rows each time, but for the clock."""
     with Map.create(path) as store:
         first = begin(store, session("robot-1"), message="the first")
-        write_drive(first, 3)
+        drive = write_drive(first, 4)
+        ends = (drive.nodes[0].id, drive.nodes[3].id)
+        first.add_edge(edge(*ends, EdgeKind.PROXIMITY, seed=1))
+        first.put_statistic("basin", {"g": [0.94, 0.7, 0.4]})
         first.commit()
-        store.tag("good", 1, author="tests", message="it works")
-        store.tag("best", author="tests")
-        store.untag("good", author="tests")
+        second = begin(store, session("robot-2"), message="the second")
+        other = write_drive(second, 3)
+        second.add_edge(edge(*ends, EdgeKind.PROXIMITY, seed=2))
+        second.commit()
+        store.tag("both", author=AUTHOR, message="two drives")
+        store.tag("wrong", author=AUTHOR)
+        store.untag("wrong", author=AUTHOR)
+        store.revert("head", author=AUTHOR, message="loose camera")
+        again = begin(store, session("robot-2"), message="again")
+        write_drive(again, 5)
+        again.commit()
+        store.put_words(bytes(16), {other.nodes[0].id: np.array([1, 5, 9], np.int32)})
+        zone = {Amendable.ROBOT: "robot-9", Amendable.ZONE: "Europe/London"}
+        store.amend(session("robot-2").id, zone, author=AUTHOR)
+        with store.begin_revision(author=AUTHOR, message="marks", configuration={}) as writer:
+            ahead = SE3(np.eye(3), np.array([0.0, 0.0, 0.5]))
+            writer.add_omission(Omission(OMITTED, drive.nodes[1].id, ahead, bytes(range(16))))
+            step = drive.edges[0]
+            writer.add_mark(Removal(step.a, step.b, step.kind, step.a_from_b, "a test", 5))
+            for node in drive.nodes:
+                writer.add_mark(Placement(node.id, SE3.identity()))
+            writer.add_mark(Anchor(drive.nodes[0].id, 1.0, 2.0, None, 0.5, "a test"))
+            writer.add_mark(Goal("dock", drive.nodes[1].id, SE3.identity()))
+            writer.commit()
+        third = begin(store, session("robot-3"))
+        write_drive(third, 2)
+        third.checkpoint()
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    socket.gethostname = lambda: "example"
+    write_map(sys.argv[1])

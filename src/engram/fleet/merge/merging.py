@@ -11,15 +11,13 @@ from pathlib import Path
 
 from engram.errors import InputError
 from engram.files import draft_folder
-from engram.fleet.merge.checks import check_fits, check_readable
 from engram.fleet.merge.gate import Gate
 from engram.fleet.merge.geometry import GeometryGate
 from engram.fleet.merge.pictures import picture_before_and_after
 from engram.fleet.merge.report import MergeReport
 from engram.fleet.merge.settings import MergeOptions
-from engram.fleet.merge.state import Merge
 from engram.fleet.merge.steps import Gates, merge_one
-from engram.maps import FORMAT_VERSION, Map, copy_map, publish_map
+from engram.maps import Map, copy_map, publish_map
 from engram.monitor import QUIET, Monitor, interruptible
 from engram.robot import RobotOptions, Settings
 from engram.viewing import check_picture
@@ -128,7 +126,6 @@ def _merged(
     with Map.open(path) as robot:
         try:
             monitor.check()
-            _check_before_raising(place, robot)
             with Map.open(place, writes=True) as store:
                 settings = settings.for_descriptor(robot.descriptor)
                 report = merge_one(store, robot, settings, options, gates, monitor)
@@ -140,14 +137,6 @@ def _merged(
                 report.content_hash = store.content_hash()
     report.seconds = time.perf_counter() - started
     return report
-
-
-def _check_before_raising(place: Path, robot: Map) -> None:
-    """Opening a map for writing upgrades its format; a robot's map is only read."""
-    with Map.open(place) as store:
-        if store.format_version < FORMAT_VERSION:
-            check_fits(Merge(store, robot))
-            check_readable(robot, robot.graph.nodes)
 
 
 @contextmanager

@@ -16,8 +16,8 @@ metadata = MetaData()
 
 _INT64 = BigInteger().with_variant(Integer(), "sqlite")
 
-# One row. `complete` is the number of frames once the whole drive is recorded, and in format 1,
-# which did not count them, 1; `digest` is `log_digest`.
+# One row. `complete` is the number of frames once the whole drive is recorded, before that 0;
+# `digest` is `log_digest`.
 log_table = Table(
     "log",
     metadata,
@@ -31,8 +31,8 @@ log_table = Table(
 
 
 def log_digest(header: str, complete: int) -> bytes:
-    """Hash of a log's row: of the header, and of the number of frames where they are counted."""
-    return content_digest(f"{header}{complete if complete > 1 else ''}".encode())
+    """Hash of a log's row: of the header, and of the number of frames once all are recorded."""
+    return content_digest(f"{header}{complete or ''}".encode())
 
 
 # One row a frame, numbered from 0 without gaps. The blobs have their own hashes; `digest` covers
@@ -63,6 +63,7 @@ FRAME_LOG = FileKind(
     strange=SequenceError,
     cure="restore a copy or record it again",
     busy_s=1.0,  # a second writer gives up after this; a reader never waits for a writer
+    older="record the drive again",
 )
 
 
@@ -109,6 +110,7 @@ FLIGHT_RECORD = FileKind(
     strange=SequenceError,
     cure="restore a copy",
     busy_s=1.0,
+    older="it can be read by the Engram that wrote it",
 )
 
 

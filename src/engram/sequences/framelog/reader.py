@@ -87,7 +87,7 @@ class FrameLog:
                 self._file.check_tables(connection.exec_driver_sql)
                 self._header, counted = read_header(connection)
                 stamps_ns, self._usable = _read_stamps(connection)
-                if counted > 1 and counted != len(stamps_ns):
+                if counted not in {0, len(stamps_ns)}:
                     raise MapCorruptError(
                         f"the log has {len(stamps_ns)} frames, and was recorded with {counted}"
                     )
@@ -292,7 +292,7 @@ def compose(first: OdometryStep | None, second: OdometryStep) -> OdometryStep:
 
 
 def read_header(connection: Connection) -> tuple[FrameLogHeader, int]:
-    """Header of a log, and its number of frames: 0 before it is complete, 1 if not counted.
+    """Header of a log, and its number of frames: 0 before it is complete.
 
     Raises:
         MapCorruptError: it is missing or does not match its hash.
