@@ -363,23 +363,6 @@ def test_a_count_of_frames_that_was_changed_is_told(tmp_path: Path, complete: in
         FrameLog(path)
 
 
-def test_a_log_of_before_frames_were_counted_is_read_and_goes_on(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "a.framelog", [logged(at) for at in range(PAIRS - 1)])
-    digest = content_digest(log_header().to_json().encode())
-    change(path, "UPDATE log SET complete = 1, digest = ?", digest)
-    change(path, "PRAGMA user_version = 1")
-    log = FrameLog(path)
-    assert log.complete
-    assert len(log) == PAIRS - 1
-    log.close()
-    with FrameLogWriter(path, log_header()) as writer:
-        writer.append(logged(PAIRS - 1), pair_hash(PAIRS - 1))
-        writer.checkpoint()
-        assert not FrameLog(path).complete  # one that is killed now is resumed
-    assert FrameLog(path).complete
-    assert len(FrameLog(path)) == PAIRS
-
-
 def change(path: Path, statement: str, *values: object) -> None:
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute(statement, values)
