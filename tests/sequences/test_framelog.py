@@ -24,7 +24,6 @@ from engram.errors import (
     SequenceError,
     StorageFullError,
 )
-from engram.frontend.blobs import content_digest
 from engram.geometry import SE3, propagate_covariance
 from engram.graph.model import Clock
 from engram.odometry import OdometryStatus
