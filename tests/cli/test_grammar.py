@@ -12,7 +12,6 @@ import pytest
 import typer
 
 from engram import __version__
-from engram.cli import moved
 from engram.cli.app import app
 from engram.cli.settings import AllSettings, every_setting
 from engram.cli.verbs import GROUPS, VERBS
@@ -103,31 +102,6 @@ def test_version(engram) -> None:
     ran = engram("--version")
     assert ran.status == 0
     assert ran.out.strip() == f"engram {__version__}"
-
-
-@pytest.mark.parametrize("old", sorted(moved.VERBS))
-def test_a_verb_that_moved_answers_with_its_new_name(engram, old: str) -> None:
-    ran = engram(old, "anything")
-    assert ran.status == 2
-    assert f"`engram {old}` is now `{moved.VERBS[old]}`" in ran.err
-    verb = moved.VERBS[old].split()[1]
-    assert verb == "lab" or verb in VERBS
-
-
-@pytest.mark.parametrize(
-    ("verb", "old"),
-    [(verb, old) for table in (moved.OPTIONS, moved.GONE) for verb in table for old in table[verb]],
-)
-def test_an_option_that_moved_answers_with_its_new_name(engram, verb: str, old: str) -> None:
-    words = tuple(verb.split())
-    ran = engram(*words, "a.engram", "b", "c", old, "1", "--json")
-    assert ran.status == 2
-    answer = moved.moved_option(verb, old)
-    assert answer is not None
-    assert ran.json["error"]["message"] == answer
-    new = moved.OPTIONS.get(verb, {}).get(old, "").split("=")[0].split()
-    taken = {option for one in command_of(words).params for option in one.opts}
-    assert not new or new[0] in taken
 
 
 def test_other_spellings_work(engram, street: Path, tmp_path: Path) -> None:

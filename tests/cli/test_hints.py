@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 import typer
 
-from engram.cli import moved, wording
+from engram.cli import wording
 from engram.cli.app import app
 from engram.cli.options import Drive
 from engram.cli.settings import AllSettings, every_setting
-from engram.cli.verbs import VERBS
+from engram.cli.verbs import LABORATORY, SPELLINGS, VERBS
 from engram.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +90,7 @@ TEXTS = [one for one in texts() if not one[0].startswith("centre/pages")]
 
 def command(words: tuple[str, ...]) -> Any:
     """The command of these words; None if there is none."""
-    found: Any = COMMANDS.get(moved.SPELLINGS.get(words[0], words[0]))
+    found: Any = COMMANDS.get(SPELLINGS.get(words[0], words[0]))
     for word in words[1:]:
         found = getattr(found, "commands", {}).get(word)
     return found
@@ -161,8 +161,6 @@ def test_every_option_behind_a_verb_is_one_of_it() -> None:
 def test_every_option_is_one_of_the_verbs_that_speak() -> None:
     wrong = []
     for place, line, text in TEXTS:
-        if place == "cli/moved.py":
-            continue
         verbs = next((_SPOKEN_BY[part] for part in _SPOKEN_BY if place.startswith(part)), ())
         bare = _VERB.split(text)[0]
         for option in _OPTION.findall(bare):
@@ -199,21 +197,21 @@ def test_what_the_laboratory_brings_is_named_as_its_own() -> None:
         f"{place}:{line}: {text}"
         for place, line, text in TEXTS
         for found in _VERB.finditer(text)
-        if found[1] in moved.LABORATORY and "engram-lab" not in text
-        if place != "cli/moved.py"  # it asks whether the laboratory is installed
+        if found[1] in LABORATORY and "engram-lab" not in text
+        if place != "cli/verbs.py"  # it asks whether the laboratory is installed
     ]
     assert wrong == []
 
 
 def test_the_laboratorys_verbs_are_those_of_its_distribution() -> None:
     project = tomllib.loads((ROOT / "lab/pyproject.toml").read_text())["project"]
-    assert set(moved.LABORATORY) == project["entry-points"]["engram.verbs"].keys()
+    assert set(LABORATORY) == project["entry-points"]["engram.verbs"].keys()
 
 
-@pytest.mark.parametrize("line", ["demo", "lab simulate hamlet", "simulate hamlet", "evaluate"])
+@pytest.mark.parametrize("line", ["demo", "lab simulate hamlet"])
 def test_a_verb_of_the_laboratory_says_where_it_comes_from(line: str) -> None:
     without = typer.main.get_command(app)
-    for name in moved.LABORATORY:
+    for name in LABORATORY:
         without.commands.pop(name, None)
     with pytest.raises(InputError, match=r"engram-lab, which is not installed.*pip install"):
         without.main(line.split(), standalone_mode=False)

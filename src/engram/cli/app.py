@@ -11,10 +11,9 @@ import typer
 
 from engram import __version__
 from engram.cli.endings import ExitStatus, PartlyDoneError, VerbInterruptedError
-from engram.cli.moved import SPELLINGS, moved_option
 from engram.cli.screen import UnwritableError, forget, screen
 from engram.cli.verbs import Program, register
-from engram.errors import EngramError, InputError, UnfitDriveError
+from engram.errors import EngramError, UnfitDriveError
 
 app = typer.Typer(
     name="engram",
@@ -69,9 +68,6 @@ def _run() -> None:
     try:
         code = app(prog_name="engram", standalone_mode=False)
     except _UsageError as error:  # a verb or option that is mistyped
-        if answer := _moved(error):
-            _complain(InputError(answer))
-            sys.exit(ExitStatus.BAD_INPUT)
         _tell_machines(error.format_message(), type(error).__name__)
         error.show()
         sys.exit(error.exit_code)
@@ -95,15 +91,6 @@ def _run() -> None:
         )
         sys.exit(ExitStatus.BAD_INPUT)
     sys.exit(code)
-
-
-def _moved(error: Any) -> str | None:
-    """What an option that is not known is called now; None if it never was one."""
-    option = getattr(error, "option_name", None)
-    if option is None or error.ctx is None:
-        return None
-    typed = error.ctx.command_path.split()[1:]
-    return moved_option(" ".join(SPELLINGS.get(word, word) for word in typed), option)
 
 
 def _status_of(error: EngramError | VerbInterruptedError) -> int:

@@ -10,7 +10,6 @@ from typing import Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from engram.cli import moved
 from engram.cli.agent import agent_group
 from engram.cli.centre import centre_group
 from engram.cli.doctor import doctor
@@ -64,6 +63,10 @@ NESTED: dict[str, dict[str, typer.Typer]] = {
     "Service": {"centre": centre_group, "agent": agent_group},
 }
 
+# What the laboratory brings, a distribution of its own.
+LABORATORY = ("demo", "lab")
+# Other spellings of a verb.
+SPELLINGS = {"localize": "localise"}
 # Section of the verbs that installed packages add.
 _ADDED = "Lab"
 # Characters of a summary: a line of 80 holds it beside the name.
@@ -72,7 +75,7 @@ _RESUMABLE = "interrupted; finished parts are kept, and the same command resumes
 
 
 class Program(TyperGroup):
-    """Lists verbs by group, knows other spellings, and answers to old names with the new."""
+    """Lists verbs by group, and knows other spellings."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """One section of the help for each group."""
@@ -90,17 +93,19 @@ class Program(TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """The verb of this name, in either spelling."""
-        return super().get_command(ctx, moved.SPELLINGS.get(cmd_name, cmd_name))
+        return super().get_command(ctx, SPELLINGS.get(cmd_name, cmd_name))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The verb that the arguments begin with.
 
         Raises:
-            InputError: it has another name now, or comes with a package that is not installed.
+            InputError: it comes with the laboratory, which is not installed.
         """
-        answer = moved.moved_verb(args[0], self.commands)
-        if answer := answer or moved.brought_verb(args[0], self.commands):
-            raise InputError(answer)
+        if args[0] in LABORATORY and args[0] not in self.commands:
+            raise InputError(
+                f"`engram {args[0]}` comes with engram-lab, which is not installed; from "
+                "a checkout of Engram: pip install ./lab"
+            )
         return super().resolve_command(ctx, args)
 
 
