@@ -16,7 +16,7 @@ from engram.graph.model import PathEntryKind, path_id
 Array = NDArray[np.float64]
 
 # Hours over which affinity falls to 1/e: inliers fall from 138 to 28 within five hours.
-# Source: lab/reports/constants-fleet.md.
+# Source: lab/reports/constants.md.
 _DECAY_H = 5.0
 _HOUR_BINS = 13
 # Pseudo-counts: the weight of each prior, in attempts.

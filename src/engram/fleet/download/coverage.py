@@ -48,7 +48,7 @@ _GATE_RAD = float(np.deg2rad(60.0))
 _STRICT = SearchConfig(slack_sigmas=0.0, slack_m=0.0)
 # Attempts on nodes of one session fail together more often than independent ones:
 # P(second matches | first did not) is 0.2 to 0.3 where g gives 0.5.
-# Source: lab/reports/constants-fleet.md.
+# Source: lab/reports/constants.md.
 _APART = 0.6
 _LEAST_GAIN = 1e-9
 

@@ -24,11 +24,11 @@ from engram.graph.sun import day_of_year, sun_height_deg
 Array = NDArray[np.float64]
 
 # A drive three hours away counts 60 % of one at the same hour, and every drive a little, since the
-# hour does not determine the weather. Source: lab/reports/constants-fleet.md.
+# hour does not determine the weather. Source: lab/reports/constants.md.
 _MISSION_H = 3.0
 _LEAST_WEIGHT = 0.1
 # Standard deviations if the sun's height is known: the hour then only separates morning from
-# evening. Source: lab/reports/constants-fleet.md.
+# evening. Source: lab/reports/constants.md.
 _SUN_DEG = 10.0
 _SIDE_H = 4.0
 _LEAST_SIDE = 0.3
@@ -36,7 +36,7 @@ _LEAST_SUN_WEIGHT = 0.05
 # Heights are clipped to these.
 _NIGHT_DEG, _NOON_DEG = -10.0, 45.0
 # The range of heights that decides whether two sessions match at all: from civil dusk to a low sun.
-# Source: lab/reports/constants-fleet.md.
+# Source: lab/reports/constants.md.
 DUSK_DEG, LOW_DEG = -6.0, 10.0
 _LATITUDES_DEG = (-60.0, -52.5, -45.0, -37.5, -30.0, -15.0, 0.0, 15.0, 30.0, 37.5, 45.0, 52.5, 60.0)
 # Most attempts of one pair of sessions that count: more repeat the same light.
@@ -44,7 +44,7 @@ _PAIR_ATTEMPTS = 20.0
 # Differences in hours are clipped to this.
 _FAR_H = 8.0
 # Least advantage in log likelihood over the model by hours, for which a latitude is accepted.
-# Source: lab/reports/constants-fleet.md.
+# Source: lab/reports/constants.md.
 _LEAST_EVIDENCE = 10.0
 # Most sessions in the fit, those with most attempts first: its cost grows with their cube.
 _JUDGED_SESSIONS = 120

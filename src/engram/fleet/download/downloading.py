@@ -37,7 +37,7 @@ from engram.maps import Map, compact_map, publish_map
 from engram.monitor import QUIET, Monitor
 
 # Bytes of a node beside its blobs: rows and indices of it, its edges and path entries. Only the
-# start of the search for a budget: the file is measured. Source: lab/reports/constants-fleet.md.
+# start of the search for a budget: the file is measured. Source: lab/reports/constants.md.
 _ROWS_BYTES = 2500
 _PAGE_BYTES = 4096
 _TRIES = 8

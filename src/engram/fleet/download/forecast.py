@@ -66,7 +66,7 @@ def _few(*known: Interval | None) -> tuple[Interval | None, ...]:
 
 
 # (low, high) of each bin, by weather, by whether a drive of the map had the mission's light, and by
-# whether the map has few drives. Source: `engram_lab.fits.forecasts fit`, lab/reports/forecasts.md.
+# whether the map has few drives. Source: `engram_lab.fits.forecasts fit`, lab/reports/downloads.md.
 INTERVALS: dict[tuple[Weather, bool, bool], tuple[Interval | None, ...]] = {
     (Weather.DRY, True, True): _few((0.0, 0.01), (0.0, 0.08)),
     (Weather.DRY, True, False): (

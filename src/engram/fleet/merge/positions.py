@@ -12,7 +12,7 @@ from engram.localiser import Position
 Array = NDArray[np.float64]
 
 # Standard deviations of an omitted node's position, whose match covariance is not stored: wide
-# against the errors of matches. Source: lab/reports/constants-fleet.md.
+# against the errors of matches. Source: lab/reports/constants.md.
 _OMITTED_SIGMA_M = 0.2
 _OMITTED_SIGMA_RAD = float(np.deg2rad(1.0))
 

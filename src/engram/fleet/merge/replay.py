@@ -213,7 +213,7 @@ class Replay(Keeper):
             self._settings,
             policy=options.ranking,
             # A lost robot gets no more attempts, since the next node tries again.
-            # Source: lab/reports/constants-fleet.md.
+            # Source: lab/reports/constants.md.
             budget=Budget(options.lanes, options.rounds, lost_rounds=options.rounds),
             relocaliser=relocaliser,
             live=session.id,
