@@ -1,4 +1,4 @@
-"""[L15 §V]: the worked example of method §4, and the kernel against exact fractions."""
+"""[L15 §V]: a worked example, and the kernel against exact fractions."""
 
 import dataclasses
 
@@ -39,7 +39,7 @@ def posterior_of(memory: PathMemory, candidates, observed, outcomes, reference, 
     return weights / weights.sum(), scores
 
 
-# [L15 Fig. 5] as method §4 works it out; n1…n9 are the indices 1…9.
+# [L15 Fig. 5]; n1…n9 are the indices 1…9.
 EXAMPLE_PATHS = [[1, 2, 3, 4, 9], [6, 7, 8, 4, 5]]
 EXAMPLE_OBSERVED = [1, 2, 3, 4, 8]
 EXAMPLE_OUTCOMES = [True, True, True, True, False]

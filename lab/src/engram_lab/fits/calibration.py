@@ -1,7 +1,7 @@
 """How hard the world is, by the reference matcher, on a loop of 0.15 km.
 
-The world's difficulty was set once, before any evaluation, against facts from outside;
-`lab/reports/town.md` says where each bound comes from.
+The world's difficulty was set once, before any evaluation, against facts from outside
+(`lab/reports/town.md`).
 """
 
 from __future__ import annotations

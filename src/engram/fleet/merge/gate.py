@@ -18,7 +18,7 @@ from engram.robot import RobotOptions, Settings, measure, open_drive, session_of
 from engram.robot.session import DriveSequence
 from engram.sequences import FrameLog, first_pair_hash
 
-# method §8: A beats B if P_A ≤ P_B up to 20 m and A's longest gap is at most 1.5 times B's.
+# Map A is no worse than B if P_A ≤ P_B up to 20 m and A's longest gap is at most 1.5 times B's.
 _JUDGED_M = np.arange(0.0, 20.5, 0.5)
 _LONGEST_GAP_RATIO = 1.5
 # From a random point of the route: long gaps count by their length.
@@ -156,7 +156,7 @@ class Gate:
 
 
 def what_is_worse(after: Sequence[Drive], before: Sequence[Drive]) -> str:
-    """How one map is worse than another (method §8, "A beats B"); "" if it is not.
+    """How one map is worse than another (failure curve of method §8, longest gap); "" if it is not.
 
     Args:
         after, before: the same drives in both maps.
