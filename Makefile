@@ -16,7 +16,8 @@ endif
 # Tests, builds and centres start many processes: each would compile all of Engram again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: setup demo centre-demo test test-services test-long test-ros goldens check format clean
+.PHONY: setup demo centre-demo test test-services test-long test-ros goldens check format clean \
+	docs wheels test-wheels test-arm64 release-steps
 
 setup: $(STAMP)
 
@@ -62,19 +63,35 @@ goldens: setup
 	$(BIN)/python -m tests.goldens check --all
 
 check: setup
-	$(BIN)/ruff format --check src lab tests ros examples
-	$(BIN)/ruff check src lab tests ros examples
+	$(BIN)/ruff format --check src lab tests ros examples release
+	$(BIN)/ruff check src lab tests ros examples release
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 format: setup
-	$(BIN)/ruff format src lab tests ros examples
-	$(BIN)/ruff check --fix src lab tests ros examples
+	$(BIN)/ruff format src lab tests ros examples release
+	$(BIN)/ruff check --fix src lab tests ros examples release
 
 docs: setup
 	$(BIN)/python -m pip install --quiet -c constraints.txt --group docs
 	$(BIN)/python -m sphinx -W --keep-going -q -b html docs build/docs
 	@echo "build/docs/index.html"
+
+# Source distributions and wheels in dist/: one for 3.11, one for 3.12 and later.
+wheels:
+	$(PYTHON) release/wheels.py
+
+# In bare environments of every Python at hand; ON=3.12 picks one, SUITE=1 runs all tests there.
+test-wheels: setup
+	$(BIN)/python -m pytest -q $(if $(SUITE),,-m 'not long') $(if $(ON),-k '$(ON)') release/test_install.py
+
+# Needs Debian's cross-compiler and an emulator: it says which packages.
+test-arm64: setup
+	$(BIN)/python release/arm64.py
+
+# What the workflows in .github run, here, in a clean clone.
+release-steps:
+	$(PYTHON) release/steps.py $(STEPS)
 
 clean:
 	rm -rf $(VENV) build lab/build demo centre-demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from engram.odometry import OutsideMotion
     from engram.robot import Robot, Settings, map_drive, open_drive
 
-__version__ = "0.1.0"
+__version__ = "0.2.0a1"
+# Printed where somebody might rely on more: by `--version`, and beside a format that is refused.
+PRE_RELEASE = "a pre-release: map format, settings and Python names may change without notice"
 
 __all__ = [
     "SE3",

@@ -9,7 +9,7 @@ from typing import Annotated, Any, cast
 
 import typer
 
-from engram import __version__
+from engram import PRE_RELEASE, __version__
 from engram.cli.endings import ExitStatus, PartlyDoneError, VerbInterruptedError
 from engram.cli.screen import UnwritableError, forget, screen
 from engram.cli.verbs import Program, register
@@ -29,7 +29,7 @@ app = typer.Typer(
 
 def _print_version(asked: bool) -> None:
     if asked:
-        print(f"engram {__version__}")
+        print(f"engram {__version__}, {PRE_RELEASE}")
         raise typer.Exit
 
 

@@ -26,6 +26,7 @@ from sqlalchemy.dialects.postgresql import insert as insert_postgresql
 from sqlalchemy.dialects.sqlite import insert as insert_sqlite
 from sqlalchemy.exc import ArgumentError, DataError, DBAPIError
 
+from engram import PRE_RELEASE, __version__
 from engram.centre.errors import StoreError
 from engram.centre.store.schema import VERSION, centre, metadata
 from engram.errors import FormatVersionError, InputError, MissingExtraError, StorageFullError
@@ -120,7 +121,7 @@ class ServiceDatabase:
         if version > VERSION:
             raise FormatVersionError(
                 f"the centre's tables are of version {version}, this Engram reads up to "
-                f"{VERSION}: upgrade Engram"
+                f"{VERSION}: upgrade Engram ({__version__} is {PRE_RELEASE})"
             )
         for step in range(version, VERSION):
             for statement in MIGRATIONS[step]:
