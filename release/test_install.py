@@ -95,11 +95,10 @@ def test_the_first_map_page_runs_from_the_wheel_alone(
     wall_s, cpu_s = time.monotonic(), _children_cpu_s()
     bare.install(f"engram-localisation=={engram.__version__}")
     size_mb, fixed = bare.installed_mb, False
+    bare.install(f"engram-localisation[plots]=={engram.__version__}")  # the page draws a map
     printed = ""
     for block in blocks(DOCS / "first-map.md"):
         for words in block.commands:
-            if words[1] == "plot":
-                bare.install(f"engram-localisation[plots]=={engram.__version__}")
             ran = bare.run(*words, cwd=street)
             printed = ran.stdout + ran.stderr
             if words[1] == "localise" and not fixed:
