@@ -187,11 +187,14 @@ def test_arguments_that_do_not_fit_are_refused(change: dict, error: type) -> Non
 
 def test_same_bits_on_every_instruction_set() -> None:
     code = """
-import sys
+import hashlib, sys
+import numpy as np
 sys.path.insert(0, sys.argv[1])
 from tests.odometry.test_window_kernel import Problem
-import hashlib
-result = Problem(frames=5, points=60, seed=9, gross=5).solve()
+problem = Problem(frames=5, points=60, seed=9, gross=5)
+# NumPy's products of matrices differ in their last bits from processor to processor.
+start = np.array([t.matrix() for t in problem.start]).astype(np.float32).astype(float)
+result = problem.solve(world_from_cam=start)
 print(hashlib.sha256(b"".join(part.tobytes() for part in result[:2])).hexdigest())
 """
     assert len(printed(code)) == 1

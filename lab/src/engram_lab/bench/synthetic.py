@@ -111,5 +111,5 @@ class SyntheticPlace:
         sigma = np.full(len(nodes), 0.1)
         zeros = np.zeros(len(nodes))
         pivots = np.zeros((len(nodes), 3))
-        distance = np.hypot(along, across)
+        distance = np.sqrt(along**2 + across**2)  # unlike hypot's, its bits are the same everywhere
         return Neighbourhood(nodes, poses, distance, along, across, zeros, sigma, sigma, pivots)
