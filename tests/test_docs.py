@@ -71,6 +71,8 @@ _ELSEWHERE = (
     "engram map colour.engram",
     "engram live town.engram",
 )
+# Where a centre listens unless told otherwise; another run of the tests may have that port.
+_USUAL_CENTRE = "http://127.0.0.1:8440"
 _FENCE = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.M | re.S)
 
 
@@ -173,15 +175,18 @@ def _write_bags(drive: Path, folder: Path) -> None:
 
 
 @pytest.fixture
-def served() -> Iterator[Callable[[list[str]], None]]:
-    """Runs a centre beside the page's other commands, until the page ends."""
+def served() -> Iterator[Callable[[list[str]], str]]:
+    """Runs a centre on a free port, until the page ends; its address."""
     running: list[subprocess.Popen[str]] = []
 
-    def serve(words: list[str]) -> None:
+    def serve(words: list[str]) -> str:
         program = [sys.executable, "-c", "from engram.cli import main; main()", *words[1:]]
+        program += ["--port", "0"]
         running.append(subprocess.Popen(program, stdout=subprocess.PIPE, text=True))
         assert running[-1].stdout is not None
-        assert "engram centre at" in running[-1].stdout.readline()
+        told, _, address = running[-1].stdout.readline().strip().partition(" at ")
+        assert told == "engram centre"
+        return address
 
     yield serve
     for one in running:
@@ -257,7 +262,7 @@ def test_the_examples_of_a_page_run_in_their_order(
     request: pytest.FixtureRequest,
 ) -> None:
     folder(EXAMPLES[page])
-    last = ""
+    last, centre = "", ""
     names: dict[str, object] = {"my_camera": _my_camera}
     printed = ""
     for block in blocks(page):
@@ -279,8 +284,9 @@ def test_the_examples_of_a_page_run_in_their_order(
                 # A person copies the id from `engram info --sessions`.
                 given = [_first_session(words[2]) if one == "SESSION" else one for one in words]
                 given = [last if one == "CODE" else one for one in given]
+                given = [centre if one == _USUAL_CENTRE else one for one in given]
                 if words[1:3] == ["centre", "serve"]:
-                    request.getfixturevalue("served")(given)
+                    centre = request.getfixturevalue("served")(given)
                     continue
                 ran = run_words(given)
                 last = (ran.stdout.split() or [""])[-1]
