@@ -6,10 +6,15 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+# Tests run side by side, one process a core: the threads of BLAS would wait for each other, which
+# they do by spinning. Set before NumPy is loaded, and inherited by all processes that tests start.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import cv2
 import hypothesis
 import pytest
 
+from engram.robot import RobotOptions, Settings, map_drive, open_drive
 from engram_lab.bench.data import synthetic_drive
 
 # A busy machine is no failure: no test has a time limit.
@@ -68,3 +73,11 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     (folder / "calibration.toml").write_text("\n".join(["[rectified]", *values]) + "\n")
     return folder
+
+
+@pytest.fixture(scope="session")
+def mapped_street(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of the street, to be read; a test that writes copies it."""
+    path = tmp_path_factory.mktemp("maps") / "town.engram"
+    map_drive(path, open_drive(street), Settings(), RobotOptions())
+    return path

@@ -7,6 +7,7 @@ descriptors of its own, so that frames of different appearances never match.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -41,6 +42,9 @@ class World:
         along = rng.uniform(-10, self.length_m + 40, count)
         side = rng.choice([-1.0, 1.0], count) * rng.uniform(4.0, 7.0, count)
         height = rng.uniform(-4.0, 1.5, count)
+        if np.isinf(self.radius_m):
+            self.points = np.column_stack([side, height, along])
+            return
         self.points = np.array(
             [
                 self.pose_at(s) @ np.array([x, y, 0.0])
@@ -60,8 +64,15 @@ class World:
 
     def descriptors(self, appearance: int) -> np.ndarray:
         """(P, 32) uint8 of all points in one appearance of the world."""
-        rng = np.random.default_rng([self.seed, appearance])
-        return rng.integers(0, 256, (len(self.points), 32), dtype=np.uint8)
+        return _random_descriptors(len(self.points), self.seed, appearance)
+
+
+@lru_cache(maxsize=8)
+def _random_descriptors(count: int, seed: int, appearance: int) -> np.ndarray:
+    rng = np.random.default_rng([seed, appearance])
+    drawn = rng.integers(0, 256, (count, 32), dtype=np.uint8)
+    drawn.setflags(write=False)
+    return drawn
 
 
 def see(

@@ -9,18 +9,9 @@ import pytest
 from engram.ranking import policy_names
 
 
-@pytest.fixture(scope="module")
-def town(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from engram.robot import RobotOptions, Settings, map_drive, open_drive
-
-    path = tmp_path_factory.mktemp("explained") / "town.engram"
-    map_drive(path, open_drive(street), Settings(), RobotOptions())
-    return path
-
-
 @pytest.mark.parametrize("policy", sorted({*policy_names()} - {"oracle"}))
-def test_every_policy_is_explained(engram, street: Path, town: Path, policy: str) -> None:
-    ran = engram("localise", town, street, "--explain", 6, "--ranking", policy, "--json")
+def test_every_policy_is_explained(engram, street: Path, mapped_street: Path, policy: str) -> None:
+    ran = engram("localise", mapped_street, street, "--explain", 6, "--ranking", policy, "--json")
     assert ran.status == 0
     assert "NaN" not in ran.out, "which is no JSON"
     found = ran.json
@@ -43,8 +34,8 @@ def test_every_policy_is_explained(engram, street: Path, town: Path, policy: str
     assert bool(found["rule"]) is (policy != "random")
 
 
-def test_text_names_terms_and_outcomes(engram, street: Path, town: Path) -> None:
-    ran = engram("localise", town, street, "--explain", 6, "--ranking", "recall")
+def test_text_names_terms_and_outcomes(engram, street: Path, mapped_street: Path) -> None:
+    ran = engram("localise", mapped_street, street, "--explain", 6, "--ranking", "recall")
     assert ran.status == 0
     assert "frame 6: localised" in ran.out
     assert "past drives: how past drives fared" in ran.out
@@ -52,8 +43,10 @@ def test_text_names_terms_and_outcomes(engram, street: Path, town: Path) -> None
     assert "matched," in ran.out
 
 
-def test_a_frame_without_candidates_is_told_as_such(engram, street: Path, town: Path) -> None:
-    ran = engram("localise", town, street, "--explain", 0)
+def test_a_frame_without_candidates_is_told_as_such(
+    engram, street: Path, mapped_street: Path
+) -> None:
+    ran = engram("localise", mapped_street, street, "--explain", 0)
     assert ran.status == 0
     assert "nothing to rank" in ran.out
 
@@ -68,8 +61,8 @@ def test_a_frame_without_candidates_is_told_as_such(engram, street: Path, town: 
     ],
 )
 def test_what_cannot_be_explained_is_refused(
-    engram, street: Path, town: Path, arguments: tuple[object, ...], complaint: str
+    engram, street: Path, mapped_street: Path, arguments: tuple[object, ...], complaint: str
 ) -> None:
-    ran = engram("localise", town, street, *arguments)
+    ran = engram("localise", mapped_street, street, *arguments)
     assert ran.status == 2
     assert complaint in ran.err

@@ -60,22 +60,22 @@ _SPARED = {("doctor", "--skip-bad")}
 def texts() -> Iterator[tuple[str, int, str]]:
     """File, line and text of every string that is no docstring; values as `{}`."""
     for path in sorted(SOURCE.rglob("*.py")):
-        tree = ast.parse(path.read_text())
+        nodes = list(ast.walk(ast.parse(path.read_text())))
         passed = {
             id(node.body[0].value)
-            for node in ast.walk(tree)
+            for node in nodes
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef)
             and node.body
             and isinstance(node.body[0], ast.Expr)
         }
-        for node in ast.walk(tree):
+        for node in nodes:
             if isinstance(node, ast.JoinedStr):
                 passed |= {id(part) for part in node.values}
                 parts = (
                     part.value if isinstance(part, ast.Constant) else "{}" for part in node.values
                 )
                 yield _place(path), node.lineno, "".join(map(str, parts))
-        for node in ast.walk(tree):
+        for node in nodes:
             text = isinstance(node, ast.Constant) and isinstance(node.value, str)
             if text and id(node) not in passed:
                 yield _place(path), node.lineno, node.value

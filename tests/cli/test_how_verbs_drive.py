@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from engram.errors import ConfigError
-from engram.robot import RobotOptions
 
 # Verb, what it hands its robot's options to, and where they are in what it hands over.
 VERBS = {
@@ -40,18 +39,9 @@ class SeenError(ConfigError):
     """The verb came as far as driving."""
 
 
-@pytest.fixture(scope="module")
-def a_map(street, tmp_path_factory):
-    from engram.robot import Settings, map_drive, open_drive
-
-    path = tmp_path_factory.mktemp("maps") / "m.engram"
-    map_drive(path, open_drive(street), Settings(), RobotOptions())
-    return path
-
-
 @pytest.mark.parametrize("verb", VERBS)
 def test_the_settings_rank_and_attempt_unless_options_do(
-    engram, monkeypatch, a_map, street, tmp_path, verb
+    engram, monkeypatch, mapped_street, street, tmp_path, verb
 ):
     typed, called, asked_of = VERBS[verb]
     seen = []
@@ -63,8 +53,8 @@ def test_the_settings_rank_and_attempt_unless_options_do(
     monkeypatch.setattr(called, spied)
     monkeypatch.setattr("engram_lab.trial.check_not_sent", lambda *_: None)
     monkeypatch.setattr("engram.viewing.viewer.Viewer", lambda *_: _Nothing())
-    words = [{"m.engram": a_map, "c.engram": tmp_path / "c.engram", "DRIVE": street}.get(one, one)
-             for one in typed.split()]  # fmt: skip
+    paths = {"m.engram": mapped_street, "c.engram": tmp_path / "c.engram", "DRIVE": street}
+    words = [paths.get(one, one) for one in typed.split()]
     for config in ("linegar2015", "gadd2016"):
         ran = engram(*words, "--config", config)
         assert "far enough" in ran.err

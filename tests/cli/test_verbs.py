@@ -12,7 +12,6 @@ import pytest
 
 from engram.live import LiveProcess
 from engram.localiser import Localiser
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
 
 FRAME_KEYS = {
     "stamp_ns", "status", "node", "node_stamp_ns", "node_from_live", "inliers", "attempts",
@@ -20,13 +19,6 @@ FRAME_KEYS = {
     "candidates", "open_loop_m", "ms", "damaged", "fixed_share",
 }  # fmt: skip
 STATUSES = {"localised", "dead_reckoning", "lost", "no_odometry"}
-
-
-@pytest.fixture(scope="module")
-def mapped_street(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("maps") / "town.engram"
-    map_drive(path, open_drive(street), Settings(), RobotOptions())
-    return path
 
 
 @pytest.fixture

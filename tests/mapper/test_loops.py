@@ -28,6 +28,13 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "ring.engram"
 
 
+@pytest.fixture(scope="module")
+def lapped(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Mapped]:
+    """A map of a drifted lap and a half, and how it came about."""
+    path = tmp_path_factory.mktemp("lapped") / "ring.engram"
+    return path, map_simulated(path, drive(RING, LAP_AND_A_HALF, drift=DRIFT), closes_loops=True)
+
+
 def loop_edges(path: Path, mapped: Mapped) -> list[tuple[Edge, SE3]]:
     """Measured edges between own nodes, each with its truth."""
     with Map.open(path) as store:
@@ -40,8 +47,8 @@ def loop_edges(path: Path, mapped: Mapped) -> list[tuple[Edge, SE3]]:
     ]
 
 
-def test_a_drifted_lap_is_closed_and_then_localised_in(path: Path) -> None:
-    mapped = map_simulated(path, drive(RING, LAP_AND_A_HALF, drift=DRIFT), closes_loops=True)
+def test_a_drifted_lap_is_closed_and_then_localised_in(lapped: tuple[Path, Mapped]) -> None:
+    path, mapped = lapped
     dead_reckoned = SE3.identity()
     for seen in mapped.drive[1 : LAP_FRAMES + 1]:
         dead_reckoned = dead_reckoned @ seen.odometry.prev_from_curr
@@ -56,9 +63,10 @@ def test_a_drifted_lap_is_closed_and_then_localised_in(path: Path) -> None:
     assert (second == "localised").mean() > 0.9
 
 
-def test_a_robot_that_knows_its_chain_asks_beside_the_drive_only(path: Path) -> None:
-    mapped = map_simulated(path, drive(RING, LAP_AND_A_HALF, drift=DRIFT), closes_loops=True)
-    first_lap = mapped.steps[1 : LAP_FRAMES - 5]
+def test_a_robot_that_knows_its_chain_asks_beside_the_drive_only(
+    lapped: tuple[Path, Mapped],
+) -> None:
+    first_lap = lapped[1].steps[1 : LAP_FRAMES - 5]
     assert not any(one.looked_up for one in first_lap)
 
 
@@ -71,14 +79,10 @@ def test_a_robot_that_came_from_nowhere_asks_on_every_frame_until_it_is_found(pa
     assert mapped.statuses[20] == "localised"
 
 
-def test_the_same_drive_gives_the_same_map(tmp_path: Path) -> None:
-    hashes = set()
-    for name in ("one", "two"):
-        path = tmp_path / f"{name}.engram"
-        map_simulated(path, drive(RING, LAP_AND_A_HALF, drift=DRIFT), closes_loops=True)
-        with Map.open(path) as store:
-            hashes.add(store.content_hash())
-    assert len(hashes) == 1
+def test_the_same_drive_gives_the_same_map(lapped: tuple[Path, Mapped], path: Path) -> None:
+    map_simulated(path, drive(RING, LAP_AND_A_HALF, drift=DRIFT), closes_loops=True)
+    with Map.open(lapped[0]) as first, Map.open(path) as again:
+        assert first.content_hash() == again.content_hash()
 
 
 def test_a_loop_that_closes_at_the_very_end_is_kept(path: Path) -> None:

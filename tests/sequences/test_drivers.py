@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from engram.errors import CalibrationError, SequenceError
+from engram.frontend import StereoPair
 from engram.geometry import SE3
 from engram.sequences import BagSequence, open_drive
 from engram.sequences.bags import database
@@ -37,6 +38,7 @@ from .synthetic import HEIGHT, PAIRS, START_NS, WIDTH, camera, picture, stamp_ns
 
 PICTURES = [(stamp_ns(index), picture(index, 0), picture(index, 1)) for index in range(PAIRS)]
 CAMERA = camera()
+Street = tuple[StereoPair, ...]
 INFOS = rectified_infos(CAMERA)
 WHOLE = StereoBag(PICTURES, INFOS)
 ZEROS = {"p": np.zeros((3, 4)), "r": np.zeros((3, 3))}
@@ -222,14 +224,17 @@ class TestCameraInfo:
             open_drive(path)
 
 
+@pytest.fixture(scope="module")
+def drawn() -> Street:
+    """Three pairs of a rendered street."""
+    return synthetic_drive(3)
+
+
 class TestSignOfTheBaseline:
     """P[3] of the right camera is positive: a wrong sign, or exchanged sides? The images tell."""
 
-    STREET = synthetic_drive(3)
-    CAMERA = STREET[0].camera
-
-    def written(self, folder: Path, exchanged: bool) -> Path:
-        left, right = rectified_infos(self.CAMERA)
+    def written(self, street: Street, folder: Path, exchanged: bool) -> Path:
+        left, right = rectified_infos(street[0].camera)
         p = np.array(right["p"])
         p[0, 3] *= -1
         pairs = [
@@ -237,30 +242,32 @@ class TestSignOfTheBaseline:
                 one.stamp_ns + START_NS,
                 *((one.right, one.left) if exchanged else (one.left, one.right)),
             )
-            for one in self.STREET
+            for one in street
         ]
         return StereoBag(pairs, (left, {**right, "p": p})).write(folder / "b", "mcap")
 
-    def test_it_is_read_where_the_sides_are_in_order(self, tmp_path) -> None:
-        sequence = open_drive(self.written(tmp_path, exchanged=False))
+    def test_it_is_read_where_the_sides_are_in_order(self, drawn: Street, tmp_path: Path) -> None:
+        sequence = open_drive(self.written(drawn, tmp_path, exchanged=False))
         assert isinstance(sequence, BagSequence)
-        assert sequence.camera.baseline_m == pytest.approx(self.CAMERA.baseline_m)
+        assert sequence.camera.baseline_m == pytest.approx(drawn[0].camera.baseline_m)
         (note,) = sequence.notes
         assert "−fx·baseline" in note
         assert len(list(sequence)) == 3
 
-    def test_the_hint_for_exchanged_sides_ends_elsewhere(self, tmp_path) -> None:
-        path = self.written(tmp_path, exchanged=True)
+    def test_the_hint_for_exchanged_sides_ends_elsewhere(
+        self, drawn: Street, tmp_path: Path
+    ) -> None:
+        path = self.written(drawn, tmp_path, exchanged=True)
         with pytest.raises(CalibrationError, match=r"exchange the two folders, or topics"):
             open_drive(path)
         sequence = open_drive(path, left=RIGHT, right=LEFT)
-        np.testing.assert_array_equal(next(iter(sequence)).left, self.STREET[0].left)
+        np.testing.assert_array_equal(next(iter(sequence)).left, drawn[0].left)
 
-    def test_the_wrong_hint_does_not_lead_back(self, tmp_path) -> None:
+    def test_the_wrong_hint_does_not_lead_back(self, drawn: Street, tmp_path: Path) -> None:
         """Exchanged topics of a wrong sign look right on paper; the doctor sees the images."""
-        path = self.written(tmp_path, exchanged=False)
+        path = self.written(drawn, tmp_path, exchanged=False)
         sequence = open_drive(path, left=RIGHT, right=LEFT)
-        assert sequence.camera.baseline_m == pytest.approx(self.CAMERA.baseline_m)
+        assert sequence.camera.baseline_m == pytest.approx(drawn[0].camera.baseline_m)
 
 
 class TestPlanarYuv:
