@@ -1,6 +1,6 @@
 """The contract of feature kinds: every kind goes all the way from images to a map and back.
 
-The kind `both`, BRIEF and TEBLID side by side in 512 bits, stands for kinds of other widths.
+The kind `both`, BRIEF and the network side by side in 512 bits, stands for kinds of other widths.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from tests.core.textures import texture
+from tests.opencv import needs_contrib
 from typer.testing import CliRunner
 
 from engram import _core
@@ -36,7 +37,7 @@ from engram.frontend.blobs import decode_landmarks, encode_landmarks
 from engram.frontend.features import (
     NET,
     describe_brief,
-    describe_teblid,
+    describe_net,
     detect_corners,
     feature_kind,
     fitted_matcher,
@@ -62,11 +63,17 @@ STEP_PX = 12  # of the picture, from frame to frame
 DISPARITY_PX = 12
 FRAMES = 6
 STEP_M = CAMERA.baseline_m * STEP_PX / DISPARITY_PX
-KINDS = (*(kind.name for kind in known_kinds()), BOTH)
+KINDS = (
+    *(
+        pytest.param(kind.name, marks=[needs_contrib] if kind.name == TEBLID else [])
+        for kind in known_kinds()
+    ),
+    BOTH,
+)
 
 
 def describe_both(image: np.ndarray, pixels: np.ndarray, octaves: np.ndarray) -> np.ndarray:
-    return np.hstack([f(image, pixels, octaves) for f in (describe_brief, describe_teblid)])
+    return np.hstack([f(image, pixels, octaves) for f in (describe_brief, describe_net)])
 
 
 @pytest.fixture(autouse=True)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from tests.core.textures import shifted_pair
+from tests.opencv import needs_contrib
 
 from engram.config import from_dict, to_dict
 from engram.errors import ConfigError, SequenceError
@@ -38,7 +39,7 @@ def grey(level: float) -> np.ndarray:
     return np.clip(np.rint(level + NOISE), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("kind", [BRIEF, TEBLID])
+@pytest.mark.parametrize("kind", [BRIEF, pytest.param(TEBLID, marks=needs_contrib)])
 def test_landmarks_lie_where_the_plane_is(kind: DescriptorKind) -> None:
     frontend = Frontend(FrontendConfig(descriptor=kind))
     frame = frontend.extract(pair())

@@ -35,13 +35,13 @@ template <int vectors> struct CostRow {
   void keep(int from, int to) {
     each([&](Costs &costs, int first) {
       const Costs k = numbers() + static_cast<int16_t>(first);
-      costs = (k >= static_cast<int16_t>(from)) & (k < static_cast<int16_t>(to)) ? costs : none();
+      costs = ((k >= static_cast<int16_t>(from)) & (k < static_cast<int16_t>(to))) ? costs : none();
     });
   }
   void drop(int from, int to) {
     each([&](Costs &costs, int first) {
       const Costs k = numbers() + static_cast<int16_t>(first);
-      costs = (k >= static_cast<int16_t>(from)) & (k < static_cast<int16_t>(to)) ? none() : costs;
+      costs = ((k >= static_cast<int16_t>(from)) & (k < static_cast<int16_t>(to))) ? none() : costs;
     });
   }
 

@@ -17,6 +17,7 @@ from engram.errors import ConfigError, IncompatibleError
 from engram.frontend import network
 from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind, StereoPair
 from engram.frontend.matching import MatcherConfig
+from engram.frontend.opencv_contrib import xfeatures2d
 from engram.plugins import PluginGroup, check_is
 
 if TYPE_CHECKING:
@@ -168,12 +169,15 @@ def describe_teblid(
 
     Source: Suárez et al., Revisiting Binary Local Image Description for Resource Limited Devices,
     RA-L 2021.
+
+    Raises:
+        MissingExtraError: OpenCV lacks its contrib modules.
     """
     import cv2
 
     if not len(pixels):
         return np.empty((0, 32), dtype=np.uint8)
-    extra: Any = cv2.xfeatures2d  # OpenCV's stubs leave TEBLID out
+    extra = xfeatures2d("the feature kind teblid")
     engine = extra.TEBLID_create(_TEBLID_SCALE_FACTOR, extra.TEBLID_SIZE_256_BITS)
     keypoints = [
         cv2.KeyPoint(float(u), float(v), _TEBLID_KEYPOINT_SIZE_PX * 2 ** int(octave), 0)
@@ -210,7 +214,13 @@ FEATURES: dict[DescriptorKind, FeatureKind] = {
             describe_brief,
             good_at="the same light, small rooms; cheapest",
         ),
-        FeatureKind(TEBLID, 32, detect_corners, describe_teblid, good_at="much as brief"),
+        FeatureKind(
+            TEBLID,
+            32,
+            detect_corners,
+            describe_teblid,
+            good_at="much as brief; needs OpenCV's contrib modules",
+        ),
         FeatureKind(
             NET,
             32,

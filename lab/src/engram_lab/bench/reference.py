@@ -4,7 +4,7 @@ It is what a good engineer writes in a day with the usual libraries, every loop 
 vectorised: FAST with a grid, BRIEF, stereo by features found in both images and matched along the
 row, sub-pixel by SAD; guided matching, PoseLib's absolute pose, refinement of the stereo
 reprojection error; brute-force matching for localisation; SciPy's sparse least squares for the
-window. It shares no code with Engram, so it is an independent check of accuracy, too.
+window. It shares no algorithm with Engram, so it is an independent check of accuracy, too.
 
 Arrays: pixels (N, 2) left u, v; stereo (N, 3) left u, left v, right u; points (N, 3) metres in the
 left camera. Poses are 4×4 matrices named target_from_source.
@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
+
+from engram.frontend.opencv_contrib import xfeatures2d
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -90,7 +92,7 @@ class FrontEnd:
         self._per_cell = max(1, round(2.5 * features / cells))
         # At a lower threshold most of the time goes into corners that the grid throws away.
         self._fast = cv2.FastFeatureDetector.create(20, True)
-        self._brief = cv2.xfeatures2d.BriefDescriptorExtractor.create(32)
+        self._brief = xfeatures2d("the plain pipeline").BriefDescriptorExtractor.create(32)
 
     def extract(self, left: Bytes, right: Bytes, max_disparity_px: float = 124.0) -> Features:
         """Corners in both images, matched along the row, disparity to a fraction of a pixel."""

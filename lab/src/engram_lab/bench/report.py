@@ -111,7 +111,11 @@ class BenchReport:
         from rich.table import Table
 
         columns = ("stage", "ms", "p99", "reference ms", "ratio", "ours", "reference")
-        table = Table(title=f"{self.machine.processor}, {self.machine.isa}: {self.machine.data}")
+        notes = dict.fromkeys(stage.note for stage in self.stages if stage.note)
+        table = Table(
+            title=f"{self.machine.processor}, {self.machine.isa}: {self.machine.data}",
+            caption="\n".join(notes),
+        )
         for column in columns:
             table.add_column(column, justify="left" if column == "stage" else "right")
         for stage in self.stages:
@@ -120,7 +124,7 @@ class BenchReport:
                 stage.name,
                 f"{stage.ours.ms:.3f}",
                 f"{stage.ours.p99_ms:.3f}",
-                f"{reference.ms:.3f}" if reference else stage.note or "–",
+                f"{reference.ms:.3f}" if reference else "–",
                 f"{stage.ratio:.1f}×" if stage.ratio else "–",
                 _in_words(stage.ours.counts),
                 _in_words(reference.counts) if reference else "–",

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.frontend import StereoPair
+from engram.frontend.opencv_contrib import xfeatures2d
 from engram.geometry import SE3
 
 _FAST_THRESHOLD = 8
@@ -124,7 +125,7 @@ def _describe(image: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np
         if cells.get(cell, 0) < _PER_CELL:
             cells[cell] = cells.get(cell, 0) + 1
             chosen.append(corner)
-    brief = cv2.xfeatures2d.BriefDescriptorExtractor.create(32, False)
+    brief = xfeatures2d("the reference matcher").BriefDescriptorExtractor.create(32, False)
     kept, descriptors = brief.compute(image, chosen)
     if descriptors is None:
         return np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
