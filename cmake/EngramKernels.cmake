@@ -1,7 +1,7 @@
 # What both extension modules share: how a kernel file is compiled once per instruction set.
 
 # No contraction to FMA and no reassociation: every instruction set computes the same bits.
-set(kernel_flags -O3 -Wall -Wextra -Wno-psabi -ffp-contract=off -fno-math-errno -fno-trapping-math)
+set(kernel_flags -Wall -Wextra -Wno-psabi -ffp-contract=off -fno-math-errno -fno-trapping-math)
 
 # Compiles the kernels for one instruction set, in a namespace of its name, into the module.
 function(add_kernels module isa sources)

@@ -140,7 +140,7 @@ inline Floats openness(const Openness &map, Floats x, Floats y) {
                       (row_floor < static_cast<float>(map.height - 1));
   const Ints at = inside & (truncated(row_floor) * map.width + truncated(column_floor));
   const Addresses first = addresses_of(map.share, at);
-  const Pairs here = load_pairs(first), next = load_pairs(first + 4LL * map.width);
+  const Pairs here = load_pairs(first), next = load_pairs(first + int64_t{4} * map.width);
   const Floats a = column - column_floor, b = row - row_floor;
   const Floats found = mix(mix(as_floats(here.left), as_floats(here.right), a),
                            mix(as_floats(next.left), as_floats(next.right), a), b);

@@ -48,7 +48,7 @@ Floats mean_along(const Picture &picture, Floats column, float row, Floats du, F
     const Floats p = u - i, q = v - j;
     const Addresses at =
         addresses_of(picture.values, truncated(j) * picture.width + truncated(i));
-    const Pairs above = load_pairs(at), below = load_pairs(at + 4LL * picture.width);
+    const Pairs above = load_pairs(at), below = load_pairs(at + int64_t{4} * picture.width);
     sum += (as_floats(above.left) * (1 - p) + as_floats(above.right) * p) * (1 - q) +
            (as_floats(below.left) * (1 - p) + as_floats(below.right) * p) * q;
   }
