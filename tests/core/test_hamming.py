@@ -18,6 +18,15 @@ def test_hamming_matrix_counts_differing_bits() -> None:
     np.testing.assert_array_equal(_core.hamming_matrix(a, b), expected)
 
 
+def test_descriptors_off_the_alignment_of_words_are_refused() -> None:
+    data = np.zeros(3 * 32 + 1, np.uint8)
+    descriptors, off = data[:-1].reshape(3, 32), data[1:].reshape(3, 32)
+    assert _core.hamming_matrix(descriptors, descriptors).max() == 0
+    for pair in ((off, descriptors), (descriptors, off)):
+        with pytest.raises(ValueError, match="multiple of 8 bytes: pass a copy"):
+            _core.hamming_matrix(*pair)
+
+
 @pytest.mark.parametrize(("asked", "stands"), [("generic", True), ("v9", False)])
 def test_engram_isa_is_obeyed_or_refused(asked: str, stands: bool) -> None:
     run = subprocess.run(

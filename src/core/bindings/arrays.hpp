@@ -36,7 +36,10 @@ inline int common_width(const Descriptors &a, const Descriptors &b) {
   return width_of(a);
 }
 
+// NumPy lets bytes start anywhere; words must not: their loads may be aligned ones.
 inline const uint64_t *words(const Descriptors &descriptors) {
+  if (reinterpret_cast<uintptr_t>(descriptors.data()) % alignof(uint64_t) != 0)
+    throw nanobind::value_error("descriptors must start at a multiple of 8 bytes: pass a copy");
   return reinterpret_cast<const uint64_t *>(descriptors.data());
 }
 
