@@ -28,7 +28,7 @@ from engram.errors import EngramError, InputError, MapError, MapLockedError, Sto
 # struct flock on 64-bit Linux: type, whence, start, length, pid.
 _FLOCK = struct.Struct("hhqqi4x")
 _HOLDER_BYTES = 4096
-# Nobody is led by a link to another file, and nobody waits at a pipe.
+# Do not follow symbolic links; do not block on FIFOs.
 _OPEN_LOCK = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 _DRAFT_LOCK = "draft-lock"  # held by the process that writes the draft, for as long as it lives
 
@@ -179,7 +179,7 @@ def _holder(content: bytes) -> Holder | None:
 
 
 def check_parent(path: Path) -> None:
-    """Refuse a file to be whose folder is not there: a mistyped one is not to be made.
+    """Reject a new file whose folder does not exist (it may be mistyped).
 
     Raises:
         InputError: the folder of the file is not there.
@@ -313,9 +313,9 @@ def draft_folder(path: Path) -> Iterator[Path]:
 
 
 def remove_left_drafts(folder: Path, names: str) -> None:
-    """Remove what killed processes left of drafts; drafts that are being written stay.
+    """Remove drafts left by killed processes; drafts that are being written stay.
 
-    What cannot be removed, somebody else's, say, is in nobody's way and stays.
+    Drafts that cannot be removed, for example another user's, are left.
 
     Args:
         folder: where the files were to be.

@@ -314,7 +314,7 @@ def test_a_robot_that_enrols_again_has_its_new_name_and_one_taken_away_is_told(s
     again()
     assert [one["name"] for one in Fleet(site.centre).all(NAME)] == ["renamed"]
     disable(site.centre, agent.state.fact("robot"), "tests")
-    with pytest.raises(CentreRefusedError, match=r"\(403\): this robot was taken away for good"):
+    with pytest.raises(CentreRefusedError, match=r"\(403\): this robot was removed"):
         again()
 
 

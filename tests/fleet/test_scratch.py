@@ -122,7 +122,7 @@ def test_the_groups_maps_stay_where_the_centre_lacks_one_of_them(begun, logs, mo
     begun.unlink()
     map_one(begun, logs["c"])
     monkeypatch.setattr(building, "_merge", lambda *_: None)  # whatever might go wrong in it
-    with pytest.raises(MapError, match="lacks sessions"):
+    with pytest.raises(MapError, match="no longer contains sessions"):
         build(begun, logs, "ab")
     assert (build_folder(begun) / "group-0.engram").exists()
 

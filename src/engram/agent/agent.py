@@ -117,7 +117,7 @@ class Agent:
         return self.outbox.queue()
 
     def drove(self, localised_share: float, driven_m: float) -> bool:
-        """Notes how the live map served on a drive; falls back if a new one does not serve.
+        """Records how well the map localised a drive; falls back if a new map does badly.
 
         Returns:
             Whether it fell back to the last good map.
@@ -286,7 +286,7 @@ class Agent:
 
     @property
     def waits(self) -> bool:
-        """Whether the centre still owes something: a version, or the outcome of a hand-in."""
+        """Whether a version or the result of a hand-in is pending."""
         fact = self.state.fact
         known = {fact("runs"), fact("staged"), fact("rejected"), None, "0"}
         open_states = {row["state"] for row in self.state.outbox()} & {QUEUED, SENT}

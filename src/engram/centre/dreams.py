@@ -50,8 +50,8 @@ class Dreams:
         gate = self._centre.policy(name).gate
         if len(gate) < FEWEST_DRIVES:
             raise ConflictError(
-                f"{name} has {counted(len(gate), 'held-out drive')}: that tells nothing about "
-                f"chance; give at least {FEWEST_DRIVES} with engram centre map --gate"
+                f"{name} has {counted(len(gate), 'held-out drive')}, too few to rule out chance; "
+                f"give at least {FEWEST_DRIVES} with engram centre map --gate"
             )
         if not self.handed(name):
             raise ConflictError(f"nothing is merged into {name} yet: there is nothing to dream of")

@@ -138,8 +138,8 @@ class Centre:
         if not path.exists():
             if name in self.map_names():
                 raise InputError(
-                    f"{path} is missing, and the tables say what was merged into it: put it back "
-                    "from a backup, and robots hand in again what that lacks"
+                    f"{path} is missing, but merges into it are on record; restore it from a "
+                    "backup, and robots upload again what the backup lacks"
                 )
             Map.create(path).close()
         row = {

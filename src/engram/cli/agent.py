@@ -99,7 +99,7 @@ def sync(
 ) -> None:
     """Send and fetch maps once, as far as the link allows.
 
-    What could not be done is told by exit status 2; the next sync or run does it.
+    Exits with status 2 if anything is left; the next sync or run retries it.
 
     \b
     Examples:

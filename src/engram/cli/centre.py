@@ -122,7 +122,7 @@ def token(
 ) -> None:
     """Print a token for a person.
 
-    It signs in to the centre's pages and its HTTP interface. The role none takes NAME away.
+    It signs in to the centre's pages and its HTTP interface. The role none revokes NAME's access.
 
     \b
     Examples:

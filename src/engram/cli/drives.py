@@ -236,7 +236,7 @@ def _asked_kind(settings: Settings) -> str | None:
 
 
 def _follow(opened: Map, settings: Settings) -> None:
-    """Refuses settings that name other features than the map's, as nothing would come of them.
+    """Rejects settings whose features differ from the map's: nothing would match.
 
     Raises:
         ConfigError: they do.

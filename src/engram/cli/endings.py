@@ -1,4 +1,4 @@
-"""How a verb may end without the result that was asked for."""
+"""How a verb may end without the requested result."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ExitStatus(IntEnum):
 
 
 def untrusted_if(fatal: Sequence[Finding]) -> None:
-    """Ends a verb that did what was asked with a drive that is unfit for it.
+    """Ends a verb that finished its work on an unfit drive.
 
     Raises:
         Exit: the doctor found something fatal; stderr says what.
@@ -58,11 +58,11 @@ class VerbInterruptedError(Exception):
 
 
 class PartlyDoneError(Exception):
-    """A verb failed, or was stopped, when a part of what was asked had been done for good.
+    """A verb failed or was stopped after part of its work was committed.
 
     Attributes:
         error: what ended it.
-        done: what ``--json`` prints of the part that was done, beside the error.
+        done: what ``--json`` prints of the committed part, in addition to the error.
     """
 
     def __init__(self, error: EngramError | VerbInterruptedError, done: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What `map` and `localise` print: what became of every frame, and what to try next."""
+"""What `map` and `localise` print: frame outcomes and the suggested next command."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _lines(*lines: str) -> str:
 
 
 def _frames(summary: Mapping[str, Any]) -> list[str]:
-    """What became of every frame."""
+    """Outcomes of the frames."""
     statuses = summary["statuses"]
     fates = [f"{statuses.get(status, 0)} {words}" for status, words in _FATES.items()]
     if withdrawn := summary.get("withdrawn", 0):

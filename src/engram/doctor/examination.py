@@ -70,7 +70,7 @@ class Look:
 
 @dataclass(slots=True)
 class Evidence:
-    """What was seen of a drive; one entry a frame unless said otherwise.
+    """Evidence about a drive; one entry per frame unless noted.
 
     Attributes:
         config: the limits.

@@ -133,8 +133,8 @@ CHECKS: tuple[Check, ...] = (
     ),
     Check(
         "scale_off", _WARNING, motion.scale_off, "scale", "of the way",
-        "the distance by odometry differs from the one measured outside: focal length or baseline "
-        "is wrong, or the unit of that motion",
+        "odometry and --motion disagree on distance: wrong focal length, baseline, or unit of the "
+        "motion",
         "see that --motion is in metres and radians; calibrate again; check the baseline with a "
         "ruler",
         needs="motion from outside, --motion TOPIC or FILE, and odometry that is sure of its steps",

@@ -98,6 +98,6 @@ class Track:
 
 
 def _held(held: SE3, believed: SE3, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The covariance of a pose that stays although another is believed: with what lies between."""
+    """Covariance of the held pose, including its offset from the current estimate."""
     error = (believed @ held.inverse()).log()
     return covariance + np.outer(error, error)

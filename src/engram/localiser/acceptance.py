@@ -33,26 +33,26 @@ class AcceptanceConfig:
         rule: `confidence` weighs all evidence (`engram.localiser.confidence`); `inliers` is the
             published rule, `min_inliers` near the prediction, and the stricter one below for a
             lost robot.
-        min_confidence: least log-odds that a match is right which the position predicts: one in
-            seventy is wrong at the threshold, far fewer over all.
-        min_confidence_told: the same where no fix has confirmed the position yet: it may have been
-            told wrong, and streets look alike.
-        min_confidence_lost: the same of a match that nothing predicts: many such are tried.
-        lost_long_m: distance without a match, metres, beyond which a lost robot believes one match
-            only if it is of `sure_confidence`, and others if they agree along
-            `hypotheses.long_base_line_m`: the further it drives, the more places that look alike
-            it has tried, and the less likely it is that the map shows the road at all.
-        sure_confidence: log-odds of one fix, without those before it, from which it is believed for
-            good.
-        settle_after_m: distance along which weaker fixes must agree to be believed for good,
-            metres. Until then a contradicting one withdraws them, and no edge rests on them.
-        join_share, join_after_m: where they would join a drive to the rest of a map, they must
-            agree along this share of the way that it has hung on nothing, however sure they are,
-            but no more than so many metres: the longer the way, the more streets it has met that
-            look alike, some of them over tens of metres.
-        doubt_after: fixes that should have come since the last one, and did not, after which a
-            robot looks for itself all over the map; so does one that was told its place, until its
-            first fix. 0: neither does, before it is lost.
+        min_confidence: minimum log-odds of a match near the predicted position. At the threshold,
+            one match in seventy is wrong.
+        min_confidence_told: the same while no fix has confirmed the position: the caller may have
+            set a wrong one, and streets look alike.
+        min_confidence_lost: the same for a match without a prediction: many such are tried.
+        lost_long_m: distance without a match, metres, beyond which a lost robot accepts a single
+            match only from `sure_confidence` on, and others if they agree over
+            `hypotheses.long_base_line_m`: the further it drives, the more look-alike places it
+            has tried, and the less likely it is that the map shows the road at all.
+        sure_confidence: log-odds from which one fix, without earlier ones, is accepted
+            permanently.
+        settle_after_m: distance over which weaker fixes must agree to be accepted permanently,
+            metres. Until then a contradicting fix withdraws them, and no edge is created from them.
+        join_share, join_after_m: a disconnected drive joins the map only after fixes agree over
+            this fraction of its disconnected distance, at most `join_after_m` metres, however
+            sure they are: the longer a drive stays disconnected, the more look-alike streets it
+            passes, some of them alike over tens of metres.
+        doubt_after: number of expected but missing fixes since the last one after which a robot
+            searches the whole map; so does a robot whose position was set by the caller, until
+            its first fix. 0: neither does, before it is lost.
         rival_share: a match is refused if another of the frame, with this share of its inliers,
             lies more than `slack_m` from it and nearer to the prediction.
         min_inliers: fewest inliers of a match with a prediction.

@@ -1,12 +1,12 @@
-"""Fixes are checked by fixes: a run of them is believed for good once it has proved itself.
+"""Keeps new fixes on trial until enough of them agree.
 
 A street repeats, and matches one period off agree with each other for some metres. So the fixes
-since a robot was lost, or was told its place, are on trial. They settle once one of them is sure by
-itself, or once they have agreed along some way. A match that contradicts them before that withdraws
-them. If it comes later, the robot was rather carried elsewhere.
+since a robot was lost, or since its position was set, are on trial. They settle once one of them is
+sure by itself, or once they have agreed over some distance. A match that contradicts them before
+that withdraws them. If it comes later, the robot was rather carried elsewhere.
 
-The longer a drive hangs on nothing, the more places it meets that look alike, some of them over
-tens of metres. What joins it has to agree along a share of that way, however sure one fix is.
+The longer a drive stays disconnected, the more look-alike places it passes, some of them alike over
+tens of metres. Fixes that join it must agree over a share of that distance, however sure one is.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Where a robot is by a weak match and by what those before it led to expect.
+"""Fuses a weak match with the position predicted from earlier matches.
 
 In rain a match of few landmarks may be decimetres off, sometimes a metre, while odometry has
-carried the position of the one before on with less. What a robot is told is then the mean of both,
-each weighed by its covariance, as in a Kalman filter on SE(3) with errors to the left (Barfoot,
+carried the last match on with less error. The reported position is then the mean of both,
+weighted by their covariances, as in a Kalman filter on SE(3) with errors to the left (Barfoot,
 State Estimation for Robotics, 2017, §7.3). A match of many landmarks needs no help: on real drives
 odometry is no more exact, and errs the same way at each step. Candidates, predictions and the edges
 of a map rest on matches alone, so that what these measure counts once.

@@ -1,4 +1,4 @@
-"""What a localiser is given: the parts of a map, and the drive that it localises."""
+"""Inputs of a localiser: map parts and the drive."""
 
 from __future__ import annotations
 

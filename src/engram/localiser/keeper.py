@@ -54,7 +54,10 @@ class Keeper:
         return True
 
     def alone_m(self) -> float:
-        """Way that what the drive saved has hung on nothing, metres; 0 if it hangs on the map."""
+        """Distance driven since the nodes being saved lost their connection to the map, metres.
+
+        0 while connected.
+        """
         return 0.0
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:

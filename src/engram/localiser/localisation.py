@@ -91,7 +91,7 @@ class Position:
         live_camera: StereoCamera,
         covariance: NDArray[np.float64],
     ) -> Position:
-        """The position of a robot that stands where the robot of a node stood.
+        """Position of a robot standing where the node was recorded.
 
         The cameras of the two may be mounted at other heights, sides and angles. Without known
         mountings both cameras count as mounted alike.

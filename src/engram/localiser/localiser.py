@@ -248,7 +248,7 @@ class Localiser:
         self._guessed_m2 = guessed_m**2
 
     def standing_at(self, node: NodeId, live: Frame, covariance: NDArray[np.float64]) -> Position:
-        """Where a robot is that stands where the robot of a node stood; see `Position.mounted`.
+        """Position of a robot standing where the node was recorded; see `Position.mounted`.
 
         Args:
             node: the reference node.
@@ -637,7 +637,10 @@ class Localiser:
 
     @property
     def told_otherwise(self) -> bool:
-        """Whether the position was said to be another than the robot knew: no edge rests on it."""
+        """Whether a caller-supplied position contradicts the robot's own.
+
+        No edge is created until a fix confirms it.
+        """
         return self._prover.told_otherwise
 
     @property

@@ -1,4 +1,4 @@
-"""Proves each fix by those before it: how well the position stands, and which fixes go."""
+"""Checks each fix against earlier ones: how far the position is confirmed, what to withdraw."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Prover:
 
     Attributes:
         standing: of the position, when the frame began.
-        told_otherwise: whether somebody said another place than the robot knew, and no fix has
-            confirmed it yet.
+        told_otherwise: whether a caller-supplied position contradicts the robot's own, and no fix
+            has confirmed it yet.
         withdraws: stamps of the fixes that the frame's fix contradicts, ns.
     """
 
@@ -94,14 +94,14 @@ class Prover:
         certain: bool,
         usual: int | None = None,
     ) -> None:
-        """Checks a fix against those before it; the weaker of two that contradict goes.
+        """Checks a fix against earlier ones; of two that contradict, the weaker is withdrawn.
 
         Args:
             live: the live frame.
             success: the accepted match.
             before: the position before it; None if unknown.
-            alone_m: way that what the drive saved has hung on nothing, metres: a fix that nothing
-                predicts joins it to the map.
+            alone_m: distance driven since the nodes being saved lost their connection to the map,
+                metres: a fix that nothing predicts reconnects them.
             certain: whether odometry since the last match had only short gaps.
             usual: inliers that the node has with its neighbour; None if unknown. A robot that
                 meets a node where it was saved has more, and need not have them elsewhere.

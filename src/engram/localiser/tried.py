@@ -1,4 +1,4 @@
-"""What a drive has tried so far, from which policies learn as it goes."""
+"""Attempts made so far in this drive; ranking policies learn from them."""
 
 from __future__ import annotations
 

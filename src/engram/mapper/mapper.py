@@ -104,8 +104,8 @@ class Mapper(Memory):
         super().__init__(localiser, saver, path_id(session.id), stored)
         self.config = config or MapperConfig()
         self._loops = loops
-        # Whether the nodes being saved are connected to the rest of the map, and the way driven
-        # when the part that may not be began.
+        # Whether the nodes being saved are connected to the rest of the map, and the distance
+        # at which the disconnected part began.
         self._joined = bool((graph.sessions == graph.session_number(session.id)).all())
         self._alone_from_m = localiser.driven_m
         self._graph = graph

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def no_collections() -> Iterator[None]:
-    """No cyclic garbage is sought: records hold no cycles, and each search would visit them all.
+    """Pauses the garbage collector: records hold no cycles, and each pass would visit all of them.
 
     A process whose collector is off already keeps it off.
     """

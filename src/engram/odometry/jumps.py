@@ -1,4 +1,4 @@
-"""Jumps: images that go on elsewhere, though their stamps go on.
+"""Jumps: consecutive frames taken at different places.
 
 A robot is carried on unseen, a player skips, a buffer lags behind. Odometry then finds next to
 nothing between two frames, and as much as ever before and after them. A guess by the last speed

@@ -94,7 +94,7 @@ class LatestFix:
 
 
 class ToldFix:
-    """The newest fix of a receiver that runs beside a robot."""
+    """Latest fix of the robot's GNSS receiver."""
 
     def __init__(self) -> None:
         self._latest: Fix | None = None

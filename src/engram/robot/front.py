@@ -91,7 +91,7 @@ class Front:
 
         Raises:
             InputError: an argument is something else.
-            SequenceError: stamp, camera or images are none; see `check_pair`.
+            SequenceError: stamp, camera or images are invalid; see `check_pair`.
             IncompatibleError: the frame is another camera's.
         """
         if isinstance(arrived, StereoPair):

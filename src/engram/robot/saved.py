@@ -1,4 +1,4 @@
-"""What became of a live drive that is saved."""
+"""Outcome of saving a live drive."""
 
 from __future__ import annotations
 

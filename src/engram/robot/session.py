@@ -15,7 +15,7 @@ def session_of_drive(sequence: DriveSequence) -> Session:
     """The session of a drive: the same drive read twice is the same session (method §2.7).
 
     Raises:
-        InputError: it is no drive, but its path or a list of pairs.
+        InputError: the argument is a path or a list, not an opened drive.
         SequenceError: the drive has no usable frame.
     """
     if not isinstance(sequence, StereoSequence | FrameLog):

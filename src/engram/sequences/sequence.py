@@ -133,7 +133,7 @@ def session_of(
         first_pair_hash: `first_pair_hash` of that pair; a frame log has it as a property.
 
     Raises:
-        InputError: the robot's name is none; see `check_name`.
+        InputError: the robot's name is invalid; see `check_name`.
     """
     robot = check_name(info.robot or UNNAMED_ROBOT)
     return Session(

@@ -61,7 +61,7 @@ def enrol(centre: Centre, code: str, name: str, public_key: bytes, signature: by
         row = first_row(connection, select(codes).where(codes.c.hash == _hash(code)))
         gone = select(subjects.c.id).where(subjects.c.id == robot, subjects.c.disabled != 0)
         if connection.execute(gone).first() is not None:
-            raise NotAllowedError("this robot was taken away for good; enrol it from a new folder")
+            raise NotAllowedError("this robot was removed; enrol it again from a new folder")
         if row is None or row["expires_ns"] < now or row["used_by"] not in {None, robot}:
             raise NotAllowedError("the code is unknown, expired or used; ask for a new one")
         if row["used_by"] is None:
@@ -184,7 +184,7 @@ def subject_of(centre: Centre, token: str) -> Subject:
 
 
 def disable(centre: Centre, robot: str, by: str) -> None:
-    """Takes all tokens of a robot or person, and gives no more."""
+    """Revokes all tokens of a robot or person, and issues no more."""
     with centre.database.writing() as connection:
         connection.execute(update(subjects).where(subjects.c.id == robot).values(disabled=1))
         connection.execute(delete(tokens).where(tokens.c.subject == robot))
@@ -192,14 +192,14 @@ def disable(centre: Centre, robot: str, by: str) -> None:
 
 
 def take_away(centre: Centre, name: str, by: str) -> list[str]:
-    """Takes all tokens of the people of a name, or of the robot of a name or id, for good.
+    """Revokes all tokens of every person of this name, or of the robot of this name or id.
 
     Returns:
         Their ids.
 
     Raises:
-        UnknownError: nobody is called so.
-        InputError: several robots are.
+        UnknownError: nobody has this name.
+        InputError: several robots have it.
     """
     called = (subjects.c.name == name) | (subjects.c.id == name)
     with centre.database.reading() as connection:

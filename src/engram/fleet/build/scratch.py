@@ -178,8 +178,9 @@ class Scratch:
         missing = _missing(self.centre, self.plan)
         if missing:
             raise MapError(
-                f"{self.centre} lacks sessions that were merged into it: {', '.join(missing)}; has "
-                f"somebody reverted them meanwhile? The groups' maps stay in {self.folder}"
+                f"{self.centre} no longer contains sessions that were merged into it "
+                f"({', '.join(missing)}); they may have been reverted. The groups' maps stay in "
+                f"{self.folder}"
             )
         self._write_plan(replace(self.plan, complete=True))
         self.remove_leftovers()
