@@ -86,7 +86,7 @@ class Holder:
 
 
 class WriterLock:
-    """The lock of a file's only writer, on ``NAME-lock`` beside it, held until `release`.
+    """The lock of a file's only writer, on ``NAME-lock`` next to it, held until `release`.
 
     An open-file-description lock: unlike flock it can be asked about without taking it, unlike
     POSIX record locks it also excludes a second writer in the same process, and the kernel drops
@@ -146,7 +146,7 @@ class WriterLock:
 
 
 def current_holder(path: Path) -> Holder | None:
-    """Who writes to a file now; None if nobody does. Disturbs nobody."""
+    """The process that writes to a file now; None if there is none. Takes no lock."""
     try:
         file = os.open(_lock_path(path), os.O_RDONLY | _OPEN_LOCK)
     except OSError:
@@ -223,7 +223,7 @@ def check_output_folder(path: Path) -> None:
 
 
 def _try_folder(folder: Path) -> None:
-    """Makes a file without a name in a folder: permissions do not tell of all that forbids it.
+    """Creates an unnamed file in a folder: permissions alone do not show all that forbids it.
 
     Raises:
         OSError: it cannot be made.
@@ -247,7 +247,7 @@ def new_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Around making a new file: what may stand in its way, as our errors.
+    """Context of making a new file: raises whatever prevents it as our errors.
 
     Raises:
         InputError: something is there already, or the folder is not.

@@ -17,7 +17,7 @@ from engram.errors import InputError
 
 
 class Estimator(StrEnum):
-    """What P(X >= x), the chance of a long way without a match, is taken over."""
+    """What P(X >= x), the chance of a long distance without a match, is taken over."""
 
     ROUTE = "route"
     GAP = "gap"

@@ -194,7 +194,7 @@ class Agent:
         }
 
     def _fetch(self, revision: int, version: str) -> bool:
-        """Fetches the wanted version, unless it runs, is staged, or did not serve."""
+        """Fetches the wanted version, unless it is running, staged or rejected."""
         known = {self.state.fact("runs"), self.state.fact("staged"), self.state.fact("rejected")}
         if revision == 0 or version in known:
             return False
@@ -331,6 +331,6 @@ class Agent:
 
 
 def _clear(path: Path) -> None:
-    """Removes a map file with what SQLite left beside it."""
+    """Removes a map file with the files that SQLite left next to it."""
     for one in path.parent.glob(f"{path.name}*"):
         one.unlink()

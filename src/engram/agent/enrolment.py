@@ -89,7 +89,7 @@ def enrolled(folder: Path) -> AgentState:
 
 
 def _check_centre(folder: Path, url: str) -> None:
-    """That a folder is not an agent's of another centre: what it knows of that would stay."""
+    """Checks that a folder holds no agent of another centre, whose state would remain."""
     path = folder / "agent.sqlite"
     if not path.exists():
         return

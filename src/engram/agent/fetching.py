@@ -1,4 +1,4 @@
-"""Fetching the wanted version, and putting it beside the live map."""
+"""Fetches the wanted version and places it next to the live map."""
 
 from __future__ import annotations
 

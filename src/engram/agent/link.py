@@ -138,7 +138,7 @@ class Link:
         return answer
 
     def _headers(self) -> dict[str, str]:
-        """With a token, asked for if there is none: the centre's nonce, signed."""
+        """Headers with a token, requested if missing by signing the centre's nonce."""
         if not self._token:
             nonce = self.bare("/v1/token/nonce", {"robot": self._robot})["nonce"]
             signature = self._signer.sign(token_text(self._robot, nonce)).hex()
@@ -199,5 +199,5 @@ def _content(answer: httpx.Response) -> Any:
     except ValueError as error:
         raise Unreachable(
             f"no centre answers at {answer.url} (status {answer.status_code}, not JSON); check "
-            "the address, and proxies on the way"
+            "the address and any proxy"
         ) from error

@@ -1,4 +1,4 @@
-"""The outbox: hand-ins wait in it until the centre keeps them for good."""
+"""The outbox: hand-ins wait in it until the centre has stored them durably."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class Outbox:
         return changed
 
     def _note(self, row: dict[str, Any], state: str, revision: int | None, why: Any) -> None:
-        """Notes how far a hand-in is, and tells it if that is new."""
+        """Records the progress of a hand-in, and reports it if it changed."""
         if (row["state"], row["revision"], row["error"]) == (state, revision, why):
             return
         self._state.set_outbox(row["id"], state, revision, why)
@@ -169,7 +169,7 @@ class Outbox:
             yield from self._whole.parts([one])
 
     def _look(self, link: Link, row: dict[str, Any], durable_revision: int) -> bool:
-        """Looks what became of a hand-in; whether the centre knows it."""
+        """Checks the state of a hand-in; returns whether the centre has it."""
         key = self._handins().get(row["id"])
         try:
             answer = link.ask("GET", f"/v1/handins/{key}")

@@ -96,7 +96,7 @@ class AgentState:
     # -- the outbox
 
     def queue(self, key: str, manifest: bytes, parts: dict[PartHash, bytes]) -> None:
-        """Puts a hand-in into the outbox, with what the centre may lack of it."""
+        """Puts a hand-in into the outbox, with the parts that the centre may be missing."""
         with self._writing() as connection:
             (place,) = connection.execute(
                 "SELECT coalesce(max(place), 0) + 1 FROM outbox"
@@ -127,7 +127,7 @@ class AgentState:
             )
 
     def forget_outbox(self, key: str) -> None:
-        """Drops a hand-in that the centre keeps for good."""
+        """Drops a hand-in that the centre has stored durably."""
         with self._writing() as connection:
             connection.execute("DELETE FROM waiting WHERE outbox = ?", [key])
             connection.execute("DELETE FROM outbox WHERE id = ?", [key])

@@ -257,7 +257,7 @@ def _relative_pose(left: CameraInfo, right: CameraInfo, baseline_m: float) -> SE
 
 
 def _with_doubts(cameras: Cameras, baseline_m: float) -> Cameras:
-    """The cameras, with what people should know of the baseline that P states."""
+    """The cameras, with warnings about the baseline that P states."""
     if baseline_m < 0:
         note = (
             f"the projections state a baseline of {baseline_m:.6g} m: P[3] of the right camera is "

@@ -66,7 +66,7 @@ def read_yaml(text: str) -> dict[str, Any]:
 
 
 def _characters(value: Any, known: dict[int, int]) -> int:
-    """Length of what a YAML text stands for with its aliases written out, which nobody does here.
+    """Length of a YAML text if its aliases were expanded; nothing is expanded here.
 
     Args:
         value: of the base loader.

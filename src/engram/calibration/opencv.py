@@ -50,7 +50,7 @@ def parse_file_storage(
     if names is None or not {"R", "T"} <= entries.keys():
         raise CalibrationError(
             "needs two camera matrices (M1, M2), two distortions (D1, D2), R and T; give the "
-            "file that holds the intrinsics, with that of the extrinsics beside it"
+            "file with the intrinsics, and put the file with the extrinsics next to it"
         )
     width, height = _size(entries, size)
     model = _model(entries)

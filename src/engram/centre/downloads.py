@@ -94,7 +94,7 @@ class Downloads:
         return row
 
     def is_granted(self, key: str, subject: str) -> bool:
-        """Whether somebody asked for an artifact."""
+        """Whether a person or robot requested an artifact."""
         query = select(artifact_grants).where(
             artifact_grants.c.artifact == key, artifact_grants.c.subject == subject
         )
@@ -124,7 +124,7 @@ class Downloads:
             yield body
 
     def file_key(self, row: dict[str, Any]) -> str:
-        """Where the whole file is, for clients that know only files."""
+        """Path of the whole file, for clients that handle only files."""
         self.ready(row)
         return f"artifacts/{row['map']}/{row['id']}.engram"
 
@@ -135,7 +135,7 @@ class Downloads:
             return rows_of(connection, query)
 
     def expire(self) -> None:
-        """Forgets artifacts that nobody used for long; asked for again they are made again."""
+        """Removes artifacts that were not used for long; the next request makes them again."""
         limit_ns = self._centre.now_ns() - self._centre.settings.artifact_days * DAY_NS
         query = select(artifacts).where(artifacts.c.used_ns < limit_ns, artifacts.c.state != ASKED)
         with self._centre.database.reading() as connection:

@@ -109,7 +109,7 @@ class Dreams:
             return rows_of(connection, query)
 
     def due(self) -> list[dict[str, Any]]:
-        """Dreams to be dreamt now; those that others have overtaken are asked for anew."""
+        """Dreams to run now; outdated ones are cancelled and requested again."""
         found = []
         for name in self._centre.map_names():
             for row in self.listed(name, ASKED):
@@ -121,7 +121,7 @@ class Dreams:
         return found
 
     def is_due(self, row: dict[str, Any]) -> bool:
-        """Whether it is asked for, and a person did so or these are quiet hours."""
+        """Whether it is requested, and by a person or within quiet hours."""
         now = self.get(row["id"])
         quiet = self._centre.policy(row["map"]).is_quiet(self._centre.now_ns())
         return now["state"] == ASKED and (quiet or now["asked_by"] != WORKER)

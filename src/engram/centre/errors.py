@@ -6,7 +6,7 @@ from engram.errors import EngramError, MapError
 
 
 class CentreError(EngramError):
-    """A request that cannot be served as it is."""
+    """A request that cannot be fulfilled as it is."""
 
     status = 400
     title = "The request cannot be served"
@@ -20,7 +20,7 @@ class UnknownError(CentreError):
 
 
 class NotKnownError(CentreError):
-    """Who asks is not known: no token, or one that has expired."""
+    """The caller is not authenticated: the token is missing or has expired."""
 
     status = 401
     title = "A token is needed"
@@ -62,7 +62,7 @@ class QuotaError(CentreError):
 
 
 class MissingPartsError(MapError):
-    """A job lacks parts: the fleet map has changed since they were asked for."""
+    """Parts of a job are missing: the fleet map has changed since they were requested."""
 
 
 class StoreError(MapError):

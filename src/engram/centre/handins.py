@@ -32,7 +32,7 @@ from engram.transfers.manifest import decode_manifest, encode_manifest
 
 
 def handin_id(name: str, robot: str, manifest: str) -> str:
-    """The name of a hand-in, which both sides know without asking."""
+    """The name of a hand-in, which both sides can compute."""
     return hashlib.sha256(f"{name} {robot} {manifest}".encode()).hexdigest()[:32]
 
 

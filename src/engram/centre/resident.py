@@ -48,7 +48,7 @@ class ResidentMaps:
                 _close_unused(held)
 
     def close(self) -> None:
-        """Closes all maps that nobody reads now, and the others as soon as nobody does."""
+        """Closes all maps that have no readers, and the others once their readers finish."""
         with self._lock:
             for held in self._held.values():
                 held.retired = True
@@ -77,7 +77,7 @@ def _log(store: MapReader) -> tuple[Revision, ...]:
 
 
 def _inode(path: Path) -> int:
-    """Which file a path names: a restored backup is another one; 0 where there is none."""
+    """Inode of a path, by which a restored backup is noticed; 0 if the file is missing."""
     return path.stat().st_ino if path.exists() else 0
 
 

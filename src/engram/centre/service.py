@@ -114,7 +114,7 @@ class Centre:
         return str(error).replace(f"{self.folder}{os.sep}", "")
 
     def fault_of(self, error: Exception) -> str:
-        """Kind and first words of an error that nobody raised on purpose."""
+        """Kind and first words of an unexpected error."""
         return f"{type(error).__name__}: {self.words_of(error)}"[:_SHOWN_CHARACTERS]
 
     def packs(self, name: str) -> Packs:

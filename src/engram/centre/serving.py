@@ -1,4 +1,4 @@
-"""Runs the service, and a worker beside it."""
+"""Runs the service together with a worker."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def _supervised_worker(centre: Centre) -> Iterator[None]:
 
 
 def _work_beside(folder: Path, database: str | None, objects: str | None) -> None:
-    """Main function of the worker beside the service."""
+    """Main function of the worker that runs with the service."""
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service ends it
     os.nice(_WORKER_NICE)

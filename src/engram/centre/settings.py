@@ -19,7 +19,7 @@ class CentreSettings:
 
     token_s: Annotated[int, Meta(ge=10, description="life of a robot's token, s")] = 900
     nonce_s: Annotated[
-        int, Meta(ge=1, description="time to sign what a token is asked with, s")
+        int, Meta(ge=1, description="time to sign the nonce of a token request, s")
     ] = 60
     code_days: Annotated[int, Meta(ge=1, description="life of an enrolment code, days")] = 7
     bytes_a_day: Annotated[int, Meta(ge=0, description="a robot may hand in, bytes a day")] = (

@@ -176,7 +176,7 @@ def drove(
     ],
     config: Config = None,
 ) -> None:
-    """Report how well the map served on a drive.
+    """Report how well the map localised a drive.
 
     A map that served badly is replaced by the last good one.
 

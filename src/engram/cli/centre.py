@@ -37,7 +37,7 @@ def serve(
     database: Database = None,
     objects: Objects = None,
     worker: Annotated[
-        bool, typer.Option("--worker/--no-worker", help="Run a worker beside the service.")
+        bool, typer.Option("--worker/--no-worker", help="Run a worker along with the service.")
     ] = True,
 ) -> None:
     """Serve maps to robots and people.

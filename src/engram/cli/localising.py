@@ -120,7 +120,7 @@ def localise_and_print(
 
 
 def _recorder(opened: Map, sequence: Drive, outputs: Outputs) -> Recorder | None:
-    """The flight recorder, if one was asked for."""
+    """The flight recorder, if one was requested."""
     from engram.robot import Recorder
 
     if outputs.recorder is None:

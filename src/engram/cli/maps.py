@@ -26,7 +26,7 @@ class VocabularyAction(StrEnum):
 
 
 class PlotBy(StrEnum):
-    """What the colours of a plot tell apart."""
+    """What the colours of a plot distinguish."""
 
     EXPERIENCE = "experience"
     HOUR = "hour"

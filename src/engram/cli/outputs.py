@@ -14,7 +14,7 @@ from engram.files import check_output, check_output_folder
 
 
 class OutputError(EngramError):
-    """Nothing can be written where a verb was told to write."""
+    """The output of a verb cannot be written to its path."""
 
 
 def _refusing(check: Callable[[str], Path]) -> Callable[[str], Path]:

@@ -1,4 +1,4 @@
-"""The one way to the screen: whatever verbs print passes through `printable`.
+"""Output to the screen: everything that verbs print passes through `printable`.
 
 Names in maps, bags and answers of a centre are anybody's. They may hold sequences that recolour,
 clear or retitle a terminal, or turn the direction of what follows. JSON escapes them by itself.

@@ -178,7 +178,7 @@ def _change(values: dict[str, Any], change: str) -> None:
 
 
 def _value(text: str) -> Any:
-    """A TOML value; what is not valid TOML is a word, so that nobody quotes for two shells."""
+    """A TOML value; text that is not valid TOML is a string, so that nothing is quoted twice."""
     try:
         return read_toml(f"x = {text}")["x"]
     except ConfigError:
@@ -234,7 +234,7 @@ def _documented(kind: type) -> dict[str, str]:
 
 
 def _annotations(kind: Any) -> list[Any]:
-    """What is declared with a type, or with what it may be beside None."""
+    """The metadata declared with a type, or with the other arm of an optional one."""
     within = [one for arm in typing.get_args(kind) for one in getattr(arm, "__metadata__", ())]
     return [*getattr(kind, "__metadata__", ()), *within]
 

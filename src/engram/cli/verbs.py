@@ -75,7 +75,7 @@ _RESUMABLE = "interrupted; finished parts are kept, and the same command resumes
 
 
 class Program(TyperGroup):
-    """Lists verbs by group, and knows other spellings."""
+    """Lists verbs by group, and accepts other spellings."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """One section of the help for each group."""

@@ -29,7 +29,7 @@ _WHITE, _BLACK = 250, 8
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """What is known of a drive beside its frames.
+    """Facts about a drive in addition to its frames.
 
     Attributes:
         clock: meaning of the stamps.
@@ -75,7 +75,7 @@ class Evidence:
     Attributes:
         config: the limits.
         camera: of the drive; None before the first frame.
-        facts: what is known beside the frames.
+        facts: facts in addition to the frames.
         stamps_ns: stamps in the order of arrival.
         first: whether a stretch begins with the frame, so that nothing is known of the time before.
         statuses: of the frames.
@@ -156,7 +156,7 @@ class Examination:
         return len(self.evidence) >= self.evidence.config.frames
 
     def begin(self) -> None:
-        """Begins another stretch: nothing is known of the time before its first frame."""
+        """Begins another stretch: the time before its first frame is unknown."""
         self._begins, self._last = True, None
 
     def see(

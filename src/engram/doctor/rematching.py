@@ -56,7 +56,7 @@ class Rematched:
 
     @property
     def focal_factor(self) -> float | None:
-        """How many times too long the focal length is; None if that cannot be told."""
+        """Factor by which the focal length is too long; None if undetermined."""
         return self._factor(self.focal, self.baseline)
 
     @property
@@ -86,7 +86,7 @@ def _rebased(camera: StereoCamera, by: float) -> StereoCamera:
 
 
 def _peak(at: NDArray[np.float64], heights: NDArray[np.int64]) -> float:
-    """Where a parabola through the highest of evenly spaced heights and those beside it peaks."""
+    """Peak of a parabola through the highest of evenly spaced heights and its neighbours."""
     top = int(heights.argmax())
     if not 0 < top < len(at) - 1:
         return float(at[top])

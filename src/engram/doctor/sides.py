@@ -1,4 +1,4 @@
-"""How the right image of a pair lies beside the left one, by the corners that both show."""
+"""How the right image of a pair is aligned with the left one, by corners seen in both."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _ROUNDS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """How the right image of one pair lies beside the left one.
+    """How the right image of one pair is aligned with the left one.
 
     Attributes:
         offset_px: vertical offset, left minus right, at the principal point.

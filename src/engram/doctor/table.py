@@ -43,7 +43,7 @@ class Check:
     explains: tuple[str, ...] = ()
 
     def finding(self, seen: Evidence) -> Finding | float | None:
-        """The finding; else the value, which is None if it cannot be told."""
+        """The finding; else the value, which is None if undetermined."""
         value = self.measure(seen)
         limit = getattr(seen.config, self.limit) if isinstance(self.limit, str) else self.limit
         if value is None or not (value < limit if self.below else value > limit):

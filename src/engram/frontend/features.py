@@ -199,7 +199,7 @@ def detect_corners_with_net(pair: StereoPair, config: FrontendConfig, landmarks:
 def describe_net(
     image: NDArray[np.uint8], pixels: NDArray[np.float32], octaves: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
-    """192 bits of the network beside 64 of BRIEF: (N, 32) uint8. For arguments see `Describe`."""
+    """192 bits of the network with 64 of BRIEF: (N, 32) uint8. For arguments see `Describe`."""
     brief = describe_brief(image, pixels, octaves)
     return network.beside_brief(image, pixels, octaves, brief)
 

@@ -1,4 +1,4 @@
-"""The kind of features `net`: descriptors by a small network, beside some of BRIEF's bits.
+"""The kind of features `net`: descriptors by a small network, with some of BRIEF's bits.
 
 A patch of 48×48 px around each corner goes through three convolutions and a linear layer in 8-bit
 integers, whose signs are 192 bits. Light, season and weather change them far less than BRIEF; rain

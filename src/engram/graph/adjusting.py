@@ -222,7 +222,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Priors:
-    """What is known of single poses, beside the measurements.
+    """Priors of single poses, in addition to the measurements.
 
     Attributes:
         at: (P,) int64, poses whose position is known.
@@ -241,7 +241,7 @@ class Priors:
 
     @staticmethod
     def none(count: int) -> Priors:
-        """Nothing is known of N poses."""
+        """No priors for N poses."""
         nothing = np.zeros(0)
         return Priors(nothing.astype(np.int64), nothing.reshape(0, 3), nothing,
                       np.tile([0.0, -1.0, 0.0], (count, 1)), 0.0)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Which nodes hang together."""
+"""Connected components of the graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Edges of a map that was read: a struct of arrays, and records as they are asked for."""
+"""Edges of a map that was read: a struct of arrays, with records made on request."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class EdgeTable(Sequence[Edge]):
 
 
 class EdgeRecords(Sequence[Edge]):
-    """The edges of a graph: those of one table, made and kept once asked for, and later ones."""
+    """The edges of a graph: those of one table, made on first use and kept, and later ones."""
 
     def __init__(self) -> None:
         self._table: Sequence[Edge] = ()

@@ -311,7 +311,7 @@ class ExperienceGraph:
         poses: NDArray[np.float64],
         error_rows: NDArray[np.float64],
     ) -> None:
-        """`_link` for many edges, none of whose keys is known: a map being read.
+        """`_link` for many edges, all of whose keys are new: a map being read.
 
         Args:
             ends: (E, 2), a and b.

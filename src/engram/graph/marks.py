@@ -1,4 +1,4 @@
-"""What is set on a map beside what robots recorded: removals, places, anchors and goals."""
+"""Annotations of a map in addition to recordings: removals, places, anchors and goals."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ class PlacingConfig:
         Meta(
             ge=0,
             description="disagreement with the places of its ends up to which an edge holds two "
-            "placed parts together, m; parts that nothing holds together are laid out anew, "
+            "placed parts together, m; parts that nothing holds together are laid out again, "
             "the larger one excepted",
         ),
     ] = 5.0
@@ -147,7 +147,7 @@ def anchor(
     anchored: Anchored,
     config: PlacingConfig = DEFAULT_CONFIG,
 ) -> Poses:
-    """Lays out the anchored components anew, so that their anchors lie where they are known to.
+    """Lays out the anchored components again, with their anchors at their known positions.
 
     Other components keep their shape, and stand beside.
     """
@@ -245,7 +245,7 @@ class _Placing:
         return poses
 
     def _line_up(self, poses: Poses, alone: list[int], taken: NDArray[np.bool_]) -> None:
-        """Sets nodes without edges beside all others, in one pass: a map may hold thousands."""
+        """Places nodes without edges next to all others, in one pass: a map may hold thousands."""
         if not alone:
             return
         right_m, apart_m = self._right_m(poses, taken) or 0.0, self.config.apart_m

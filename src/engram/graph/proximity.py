@@ -88,7 +88,7 @@ DEFAULT_CONFIG = ProximityConfig()
 def lay_proximity_edges(
     graph: ExperienceGraph, node: int, config: ProximityConfig = DEFAULT_CONFIG
 ) -> list[Edge]:
-    """Join a node to the nearest node of each experience beside it.
+    """Join a node to the nearest node of each experience around it.
 
     Call it after the node, and the edge that chains it to the previous one or ties it, are in the
     graph. The graph gives the prediction and its uncertainty, which grows along the chain.
@@ -145,7 +145,7 @@ def tighten_chain(
 
 
 def _beside(graph: ExperienceGraph, node: int, config: ProximityConfig) -> Neighbourhood:
-    """Nodes beside a node, of any heading: chains lead through them too."""
+    """Nodes near a node, of any heading: chains lead through them too."""
     record = graph.node(node)
     near = graph.neighbourhood(
         node,

@@ -1,4 +1,4 @@
-"""The robot of a live process: its map is opened with the first frame, and anew after errors."""
+"""The robot of a live process: its map is opened with the first frame, and again after errors."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ class Driving:
         return Step(found.motion, found, trouble, *place)
 
     def _only_moved(self, front: Front, arrived: Arrived, motion: OutsideMotion | None) -> Step:
-        """Takes a frame without a map: only its motion is known."""
+        """Takes a frame without a map: it yields only motion."""
         stamp_ns, steps = stamp_of(arrived), len(front.clock.steps)
         placed = front.clock.take(stamp_ns)
         if placed:
@@ -303,7 +303,7 @@ class Driving:
         return self._robot
 
     def _use_belief(self) -> None:
-        """Gives the robot the position that was kept, if its map knows the node."""
+        """Gives the robot the position that was kept, if its map contains the node."""
         if self._robot is None or self._map is None:
             return
         belief, self._belief = self._belief, None
@@ -351,5 +351,5 @@ def _vague(position: Position) -> Position:
 
 
 def _untrusted(unfit: Sequence[Finding]) -> str:
-    """What is said of a drive with these fatal findings."""
+    """The warning about a drive with these fatal findings."""
     return "" if not unfit else "not to be trusted: " + "; ".join(one.message for one in unfit)

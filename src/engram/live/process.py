@@ -54,7 +54,7 @@ class Health:
 
 
 class LiveProcess:
-    """Runs a robot from a transport until that ends or somebody asks it to stop.
+    """Runs a robot from a transport until that ends or a stop is requested.
 
     Args:
         transport: brings frames and commands.
@@ -94,7 +94,7 @@ class LiveProcess:
 
     @property
     def unfit(self) -> tuple[Finding, ...]:
-        """Fatal findings about the drives that ended: why what was said is not to be trusted."""
+        """Fatal findings about the drives that ended: why their results cannot be trusted."""
         return self._driving.unfit
 
     def run(self) -> None:
@@ -210,7 +210,7 @@ class LiveProcess:
 
 
 def _found(step: Step) -> Message:
-    """What is said of a localisation; a pose only where there is one, with its covariance."""
+    """The message for a localisation; a pose only where there is one, with its covariance."""
     found = step.found
     if found is None:
         return {}

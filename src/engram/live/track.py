@@ -20,11 +20,11 @@ _NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """Odometry since the start. While the camera sees nothing it goes on by the guess for a while.
+    """Odometry since the start; while the camera sees nothing it continues by the guess.
 
-    Where that turns out wrong, the track goes on from the guess, rather than jump to what was
-    measured; where nothing is known any more it stays where it is. Its covariance keeps the error
-    that may be in it.
+    Where that turns out wrong, the track continues from the guess rather than jump to what was
+    measured; once nothing bounds the motion it stays where it is. Its covariance keeps the
+    possible error.
 
     Attributes:
         odom_from_live: pose of the camera in that of its first image.
@@ -42,7 +42,7 @@ class Track:
     _guessed: bool = False
 
     def after(self, step: Step, stamp_ns: int) -> Track:
-        """The track after one more frame; it holds still where nothing is known of the motion."""
+        """The track after one more frame; it holds still where the motion is unknown."""
         motion = step.motion
         since_ns = None if self._stamp_ns is None else stamp_ns - self._stamp_ns
         if motion is None:
@@ -77,7 +77,7 @@ class Track:
         return Track(stays, covariance, usable, stamp_ns, twist_per_s, guessed and not doubtful)
 
     def _without_jump(self, moved: SE3, seconds: float, guessed: bool) -> SE3:
-        """A step; going on as before, where it would make up for a wrong guess."""
+        """A step; the same motion as before where the step would make up for a wrong guess."""
         blind = self._usable is not None or guessed or self._guessed
         if not blind or self._twist_per_s is None:
             return moved

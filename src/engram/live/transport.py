@@ -35,7 +35,7 @@ class FrameEvent:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What somebody asks of the process.
+    """A request to the process.
 
     Attributes:
         do: such as `map` or `stop`; see `engram.live.link`.
@@ -59,7 +59,7 @@ class Transport(Protocol):
         ...
 
     def tell(self, message: Message) -> None:
-        """Sends a message, or drops it if nobody listens; any thread may call it."""
+        """Sends a message, or drops it if no client is connected; any thread may call it."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""How sure a match is: the log-odds that it is right, from all that is known when it is judged.
+"""How sure a match is: the log-odds that it is right, from all evidence when it is judged.
 
 A street repeats: lamps, trees and kerb stones match one period off with twenty to thirty inliers,
 consistently and with small covariances. So the number of inliers says little by itself. It counts
@@ -123,7 +123,7 @@ def _median(numbers: Iterable[int]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What is known of a match when it is judged.
+    """Evidence about a match when it is judged.
 
     Attributes:
         inliers: landmarks that agree on the pose.
@@ -181,11 +181,11 @@ class Evidence:
         return *self.match_terms(), *self.expected_terms(), math.log(ratio), agreed, tracked
 
     def doubted_terms(self) -> tuple[float, ...]:
-        """Terms of the same reading where position or match is weak, and the spread known."""
+        """Terms of the same reading, with the spread, where position or match is weak."""
         return *self.predicted_terms(), *self.spread_terms()
 
     def told_terms(self) -> tuple[float, ...]:
-        """Terms of the reading as what a position predicts that was only told."""
+        """Terms of the reading where a position that no fix has confirmed predicts the match."""
         return *self.match_terms(), *self.expected_terms(), *self.spread_terms()
 
     def anywhere_terms(self) -> tuple[float, ...]:

@@ -38,7 +38,7 @@ class Track:
         self.best: Position | None = None
 
     def set(self, position: Position | None) -> None:
-        """The robot is there, whatever was known."""
+        """Sets the position, whatever it was before."""
         self.measured = self.best = position
 
     def carry_on(self, prev_from_curr: SE3, covariance: NDArray[np.float64]) -> None:

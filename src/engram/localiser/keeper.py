@@ -11,7 +11,7 @@ from engram.odometry import Motion
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hint:
-    """What a keeper knows about a frame before it is localised.
+    """What a keeper contributes about a frame before it is localised.
 
     Attributes:
         position: where the robot is; None leaves it to the localiser.
@@ -39,7 +39,7 @@ class Keeper:
     """
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
-        """What is known before the frame is localised; `motion` led to it."""
+        """The keeper's contribution before the frame is localised; `motion` led to it."""
         del live, motion
         return None
 

@@ -20,7 +20,7 @@ from engram.graph.neighbourhood import Neighbourhood
 
 
 class Lenses:
-    """The focal lengths of a map's drives, beside that of the live camera.
+    """The focal lengths of a map's drives, compared with that of the live camera.
 
     Args:
         graph: the experience graph; it may grow.

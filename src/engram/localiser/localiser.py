@@ -190,7 +190,7 @@ class Localiser:
 
     @property
     def neighbourhood(self) -> Neighbourhood | None:
-        """Candidates Y of the last frame; None if it was not usable or nothing was known."""
+        """Candidates Y of the last frame; None if it was not usable or the position was unknown."""
         return self._near
 
     @property
@@ -598,7 +598,7 @@ class Localiser:
         return by_confidence and self.config.lookalikes.doubt > 0 and is_measured(live.descriptor)
 
     def _likeness(self, live: Frame, found: Outcome) -> Likeness | None:
-        """What the match shows; None where its node's drive saved no other beside it."""
+        """What the match shows; None if its node's drive saved no neighbour of the node."""
         usual = self._yardstick.usual(found.candidate.index)
         reference = self._attempter.frame(found.candidate.node)
         if usual is None or reference is None:

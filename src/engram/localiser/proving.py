@@ -49,7 +49,7 @@ class Prover:
 
     @property
     def doubted(self) -> bool:
-        """Whether the position may well be wrong: nobody confirmed it, or fixes fail to come."""
+        """Whether the position may well be wrong: unconfirmed, or expected fixes are missing."""
         after = self._accepted.doubt_after
         return after > 0 and (self._told or self.standing.missed >= after)
 

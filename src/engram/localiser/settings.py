@@ -73,8 +73,8 @@ class HypothesesConfig:
         float,
         Meta(
             ge=0,
-            description="the same, by matches that agree on the way, once a robot has found "
-            "nothing for `acceptance.lost_long_m`: streets look alike over tens of metres",
+            description="the same, by agreeing matches, once a robot has found nothing for "
+            "`acceptance.lost_long_m`: streets look alike over tens of metres",
         ),
     ] = 30.0
     forgotten_after_m: Annotated[
@@ -141,9 +141,9 @@ class LocaliserConfig:
         float,
         Meta(
             ge=0,
-            description="where a match is weak, a robot is told the mean of it and of what earlier "
-            "ones led to expect, whose covariance counts so many times, as their errors are not "
-            "independent; 0: the match alone",
+            description="where a match is weak, the reported position is its mean with the one "
+            "predicted from earlier matches, whose covariance is multiplied by this, as their "
+            "errors are not independent; 0: the match alone",
         ),
     ] = 2.0
     lost_max_samples: int = 256

@@ -58,7 +58,7 @@ _LIGHT_OF = 40
 
 @dataclass(frozen=True, slots=True)
 class LookalikeConfig:
-    """How runs of matches are told from runs of look-alikes.
+    """How runs of matches are distinguished from runs of look-alikes.
 
     Source: ``python -m engram_lab.checks.equal_fronts``.
     """
@@ -67,8 +67,8 @@ class LookalikeConfig:
         float,
         Meta(
             ge=0,
-            description="log-odds that a run is one of look-alikes, beyond which it is believed no "
-            "longer; 0: look-alikes are not told",
+            description="log-odds that a run is one of look-alikes, beyond which it is no longer "
+            "accepted; 0: look-alikes are not detected",
         ),
     ] = 1.59
     doubt_first: Annotated[
@@ -78,19 +78,19 @@ class LookalikeConfig:
         float,
         Meta(
             ge=0,
-            description="log-odds that it is none, from which a doubted run is believed again, and "
-            "edges rest on one",
+            description="log-odds that it is not, from which a doubted run is accepted again, and "
+            "edges are created from a run",
         ),
     ] = 0.08
     most: Annotated[
-        float, Meta(gt=0, description="log-odds of a run at most, either way: it may change")
+        float, Meta(gt=0, description="greatest absolute log-odds of a run: it may change")
     ] = 8.0
     apart_m: Annotated[
         float,
         Meta(gt=0, description="m from which two matches of a run show other things"),
     ] = 6.0
     again_m: Annotated[
-        float, Meta(ge=0, description="m after which a believed run is looked at again")
+        float, Meta(ge=0, description="m after which an accepted run is judged again")
     ] = 2.0
     forgotten_after_m: Annotated[
         float, Meta(gt=0, description="m without a match after which a run begins again")
@@ -134,7 +134,7 @@ class Yardstick:
         self._known: dict[int, Usual | None] = {}
 
     def usual(self, index: int) -> Usual | None:
-        """What the node with a dense index usually has; None if its drive saved none beside it."""
+        """What the node with a dense index usually has; None if its drive saved no neighbour."""
         if index not in self._known:
             self._known[index] = self._measured(index)
         return self._known[index]

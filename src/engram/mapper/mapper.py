@@ -251,7 +251,7 @@ class Mapper(Memory):
             )
 
     def _looks_new(self, found: Localisation) -> bool:
-        """Whether the map lacks what the frame shows; a match on trial does not tell."""
+        """Whether the frame's view is new to the map; a match on trial does not decide that."""
         if not found.localised:
             return True
         return found.inliers < self.config.sure_inliers and not self._localiser.on_trial

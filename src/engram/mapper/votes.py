@@ -38,7 +38,7 @@ class VoteConfig:
 
     against: Annotated[
         int,
-        Meta(ge=1, description="frames that contradict an edge before it is distrusted, beside "
+        Meta(ge=1, description="frames that contradict an edge before it is distrusted, plus "
              "twice the frames that agree with it"),
     ] = 4  # fmt: skip
     inliers: Annotated[
@@ -115,7 +115,7 @@ class EdgeVotes:
         return off_m > max(self.config.gross_m, self.config.sigmas * sigma_m)
 
     def _chain(self, tree: ChainTree, goal: int) -> Iterator[int]:
-        """Edges that matching made, on the way from the tree's root to a node."""
+        """Edges that matching made, on the path from the tree's root to a node."""
         row = tree.row_of[goal]
         while (half := int(tree.half_edges[row])) >= 0:
             if self._graph.edges[half // 2].kind is not EdgeKind.ODOMETRY:

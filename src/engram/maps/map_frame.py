@@ -149,7 +149,7 @@ class MapFrame:
         return FramePose.of(self.pose(goal.node) @ goal.node_from_goal)
 
     def geographic(self, x_m: float, y_m: float) -> tuple[float, float] | None:
-        """Latitude and longitude of a position, degrees; None without anchors that tell."""
+        """Latitude and longitude of a position, degrees; None without anchors on earth."""
         if self.origin is None:
             return None
         latitude = self.origin[0] + y_m / _DEGREE_M

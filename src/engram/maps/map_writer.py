@@ -246,7 +246,7 @@ class MapWriter(MapReader):
         return self._writing
 
     def _new_places(self, contents: Mapping[str, float], config: PlacingConfig) -> list[Placement]:
-        """What the open revision has to write of the layout, which is known then."""
+        """The part of the layout that the open revision has to write; completes the layout."""
         found = new_places(self, contents, config)
         if contents["placements"] or contents["hidden"]:
             self._laid_out = None

@@ -1,4 +1,4 @@
-"""Records of a map beside those of `engram.graph`."""
+"""Records of a map in addition to those of `engram.graph`."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ class RowBuffer:
         return key
 
     def put(self, table: Table, row: Row, size_bytes: int = 0) -> None:
-        """Adds a row that lacks only its checksum."""
+        """Adds a row that is complete but for its checksum."""
         self.rows[table].append(sealed(table, row))
         self.size_bytes += _ROW_BYTES + size_bytes
 

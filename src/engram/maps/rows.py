@@ -291,7 +291,7 @@ def _longitude(longitude_deg: float | None) -> float | None:
 
 
 def _zone_name(text: str) -> str:
-    """The name of a time zone, which a newer database than this machine's may know.
+    """The name of a time zone, perhaps only in a newer database than this machine's.
 
     Raises:
         MapCorruptError: it can name none.

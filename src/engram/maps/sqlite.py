@@ -225,7 +225,7 @@ class SqliteDatabase:
             MapError: the file cannot be renamed.
         """
         if _has_log(draft):
-            raise MapError(f"{draft} is still open: {path} would lack the content of its log")
+            raise MapError(f"{draft} is still open: {path} would miss the content of its log")
         with naming(path):
             _remove_orphans(path)
             publish(draft, path)
@@ -249,7 +249,7 @@ class SqliteDatabase:
             self._idle.pop().close()
 
     def _way_of_reading(self) -> str:
-        """The way to open the file for reading.
+        """How to open the file for reading.
 
         A write-ahead log needs a second file, which cannot be created on read-only media or a full
         disk. Without a log and a writer, SQLite can open the file as immutable instead.

@@ -17,7 +17,7 @@ from engram.maps.schema import tag_tally, tags
 
 
 def count_tags(connection: Connection) -> None:
-    """Writes the tally anew; call it in the transaction that changes tags."""
+    """Writes the tally again; call it in the transaction that changes tags."""
     connection.execute(delete(tag_tally))
     connection.execute(insert(tag_tally), sealed(tag_tally, {"key": 1, **_counted(connection)}))
 

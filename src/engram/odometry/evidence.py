@@ -110,7 +110,7 @@ class Speeds:
         self.strong_from = self._weak_share * self._usual
 
     def stronger_than_all(self, inliers: int) -> bool:
-        """Whether all that is known of the speed is weak beside so many inliers."""
+        """Whether the evidence for the speed is weak compared with so many inliers."""
         floor = self._floor(inliers)
         return self.any and all(one.inliers < floor for one in self._learnt)
 
@@ -164,7 +164,7 @@ class Speeds:
         return step.within_reach(strong, since_s, self._weak_m_s2)
 
     def learn(self, step: Speed) -> None:
-        """Learns the speed from a step that was believed."""
+        """Learns the speed from an accepted step."""
         self._learnt.append(step)
         newest = reversed(self._learnt)
         strong = [one.m_per_s for one in newest if one.inliers >= self.strong_from]

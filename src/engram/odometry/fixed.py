@@ -111,7 +111,7 @@ class FixedConfig:
         float, Meta(gt=0, description="most votes of a cell, so that what has gone is forgotten")
     ] = 6.0
     weak_votes: Annotated[
-        float, Meta(gt=0, description="votes after which a cell beside a fixed one is, too")
+        float, Meta(gt=0, description="votes after which a cell next to a fixed one is fixed, too")
     ] = 0.9
     forgets: Annotated[
         float, Meta(gt=0, lt=1, description="share of the votes that is forgotten at each look")
@@ -596,5 +596,5 @@ def _rests(told: SE3 | None, outside: Guess | None, motion: SE3) -> bool | None:
 
 
 def _is_small(told: float, seen: float, least: float) -> bool | None:
-    """Whether a motion is much less than what was seen; None if that is too little to tell."""
+    """Whether a motion is much less than what was seen; None if that is too little to decide."""
     return None if seen < least else told < _REST_SHARE * seen

@@ -47,14 +47,14 @@ class FrozenConfig:
         int, Meta(ge=1, description="earlier pictures that each is compared with")
     ] = 4
     rest_m: Annotated[
-        float, Meta(ge=0, description="way by wheels from frame to frame that is rest, m")
+        float, Meta(ge=0, description="distance by wheels between frames that is rest, m")
     ] = 0.02
     rest_rad: Annotated[
         float, Meta(ge=0, description="turn from frame to frame that is rest, rad")
     ] = float(np.deg2rad(0.2))
     moved_m: Annotated[
         float,
-        Meta(gt=0, description="way by wheels, m, over which a picture that stands still is old"),
+        Meta(gt=0, description="distance by wheels, m, over which a still picture is old"),
     ] = 0.3
     moved_rad: Annotated[float, Meta(gt=0, description="turn over which it is, rad")] = float(
         np.deg2rad(10.0)

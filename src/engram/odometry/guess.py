@@ -45,7 +45,7 @@ class Guess:
         return bool((off**2 > gate**2 * variances).any())
 
     def is_sharper(self, covariance: NDArray[np.float64]) -> bool:
-        """Whether it is more certain of way or turn than a measurement of (6, 6) covariance."""
+        """Whether any component is more certain than in a measurement of (6, 6) covariance."""
         known = self._known
         return bool((np.diag(self.covariance)[known] < np.diag(covariance)[known]).any())
 

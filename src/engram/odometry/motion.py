@@ -67,7 +67,7 @@ class GapConfig:
         ),
     ] = 5
     steps_to_know_speed: Annotated[
-        int, Meta(ge=1, description="measured steps after which the speed counts as known")
+        int, Meta(ge=1, description="measured steps after which the speed is used")
     ] = 3
     sharp_share: Annotated[
         float,
@@ -115,7 +115,8 @@ class GapConfig:
             ge=0,
             lt=1,
             description="a step with less than this share of the inliers before and after it was "
-            "no motion: the images go on elsewhere. 0: never. Source: lab/reports/faults.md",
+            "no motion: the frames were taken at different places. 0: never. "
+            "Source: lab/reports/faults.md",
         ),
     ] = 0.1
     jump_inliers: Annotated[
@@ -165,7 +166,7 @@ class GapConfig:
         float,
         Meta(
             ge=0,
-            description="s after which weak steps that go on are believed: a dark or wet road",
+            description="s after which a series of weak steps is accepted: a dark or wet road",
         ),
     ] = 3.0
 
@@ -382,7 +383,7 @@ class GapFiller:
         wrong_m: float,
         seconds: float,
     ) -> tuple[SE3, NDArray[np.float64]]:
-        """A step that is believed, with all that it may be wrong by, and what it makes up for."""
+        """An accepted step, with its possible error and the error of missing steps before it."""
         if wrong_m:
             covariance, sigma_m = covariance + self._wrong_by(wrong_m), math.hypot(sigma_m, wrong_m)
         if sigma_m <= self._vague_from_m(measured, seconds):
@@ -411,7 +412,7 @@ class GapFiller:
     def _missed(
         self, odometry: OdometryStep, guess: Guess, outside: Guess | None, seconds: float
     ) -> Motion:
-        """A step that was not measured, or is not believed."""
+        """A step that was not measured, or is not accepted."""
         self._missing.append(True)
         if guess is not outside:
             self._run.go_on(self._wrong_m(guess.prev_from_curr, seconds))

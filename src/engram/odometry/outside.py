@@ -148,7 +148,7 @@ class OutsideModel:
 
     @property
     def scale(self) -> float:
-        """Way by odometry over way by the wheels: 1.02 if the wheels measure 2 % too little."""
+        """Distance by odometry over distance by wheels: 1.02 if wheels measure 2 % too little."""
         known = len(self._ratios) >= _KNOWN_FROM
         return float(np.median(self._ratios)) if known else 1.0
 

@@ -27,7 +27,7 @@ class VagueRun:
         self._sum_m = 0.0
 
     def variance_m2(self, sigma_m: float) -> float:
-        """What one more step, so wrong by itself, adds to the variance of the way."""
+        """What one more step, so wrong by itself, adds to the variance of the distance."""
         return sigma_m * (sigma_m + 2.0 * self._sum_m)
 
     def go_on(self, sigma_m: float) -> None:

@@ -36,7 +36,7 @@ _PLACE_LACKS, _IMAGE_LACKS = 0b01010101, 0b00110011
 
 
 class Signatures:
-    """A `PlaceRecogniser` by the bits that signatures have in common. It knows no new places.
+    """A `PlaceRecogniser` by the bits that signatures have in common. It reports no new places.
 
     Args:
         vocabulary: of a kind that has signatures.
@@ -111,7 +111,7 @@ class Signatures:
         return agreement
 
     def _parts(self, words: Signature) -> NDArray[np.uint8]:
-        """A signature's parts (P, B); of an image of which nothing is known, lacking all."""
+        """A signature's parts (P, B); all marked missing for an image without a signature."""
         if not len(words):
             return np.full((_COLUMNS * len(self._centres), self._bytes), _IMAGE_LACKS, np.uint8)
         return words.view(np.uint8).reshape(-1, self._bytes)

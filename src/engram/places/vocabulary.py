@@ -132,7 +132,7 @@ def hash_of(vocabulary: Vocabulary) -> bytes:
 
 
 class _About(msgspec.Struct):
-    """What a vocabulary says of itself, beside its arrays."""
+    """Metadata of a vocabulary, in addition to its arrays."""
 
     format: int
     descriptor: str

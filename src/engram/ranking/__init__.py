@@ -39,7 +39,7 @@ POLICIES: dict[str, Callable[[], RankingPolicy]] = {
 
 
 def policy_names() -> list[str]:
-    """All policies that `policy_named` knows: Engram's own, then those of other packages."""
+    """All policies that `policy_named` accepts: Engram's own, then those of other packages."""
     return [*POLICIES, *(name for name in _PLUGINS.names() if name not in POLICIES)]
 
 

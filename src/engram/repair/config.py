@@ -36,15 +36,15 @@ class RepairConfig:
         float,
         Meta(
             gt=0,
-            description="length of another way between its ends up to which agreement with it "
-            "confirms an edge, m: odometry drifts by less than `gross_m` over it",
+            description="length of another path between its ends up to which agreement with that "
+            "path confirms an edge, m: odometry drifts by less than `gross_m` over it",
         ),
     ] = 40.0
     looks: Annotated[
         int, Meta(ge=1, description="pairs of nodes that are matched to judge one edge, at most")
     ] = 16
     look_within_m: Annotated[
-        float, Meta(gt=0, description="way from an edge's ends to such nodes, m, at most")
+        float, Meta(gt=0, description="greatest path length from an edge's ends to such nodes, m")
     ] = 20.0
     look_apart_m: Annotated[
         float, Meta(gt=0, description="distance at which two nodes show enough of the same, m")
@@ -105,14 +105,14 @@ class RepairConfig:
         float, Meta(ge=0, description="surety that such looks add together, at most")
     ] = 0.8
     per_look: Annotated[
-        float, Meta(ge=0, description="surety that a second look takes away which agrees")
+        float, Meta(ge=0, description="surety that each agreeing second look subtracts")
     ] = 0.15
     per_fix: Annotated[
         float,
         Meta(
             ge=0,
-            description="surety that a fix of a drive takes away which crossed the edge, of five "
-            "at most",
+            description="surety that each fix of a drive across the edge subtracts, of five at "
+            "most",
         ),
     ] = 0.2
 

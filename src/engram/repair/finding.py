@@ -245,7 +245,7 @@ class _Search:
         return self._crossings.witnessed(sides[0], sides[1], len(self._graph), pause)
 
     def _derived(self, wrong: Sequence[Finding]) -> list[Finding]:
-        """Predicted edges beside wrong ones that say the same as these."""
+        """Predicted edges near wrong ones that assert the same."""
         graph, config = self._graph, self._config
         found: dict[int, Finding] = {}
         for one in wrong:

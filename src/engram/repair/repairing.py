@@ -87,7 +87,7 @@ def check_geometry(
     pictures: Path | None = None,
     monitor: Monitor = QUIET,
 ) -> GeometryReport:
-    """Looks for wrong edges, and removes them if asked.
+    """Looks for wrong edges, and removes them on request.
 
     Args:
         path: the map.

@@ -77,7 +77,7 @@ class SecondLooks:
     def _pairs(
         self, edge: Edge, side_a: Sequence[Near], side_b: Sequence[Near]
     ) -> list[tuple[Near, Near, SE3]]:
-        """Pairs that should show the same things if the edge is right, some way apart each."""
+        """Pairs that should show the same things if the edge is right, spaced along the drives."""
         config = self._config
         found: list[tuple[float, Near, Near, SE3]] = []
         for one in side_a:

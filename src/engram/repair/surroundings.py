@@ -47,11 +47,11 @@ class Surroundings:
                 self._at[end].append(row)
 
     def around(self, root: int, reach_m: float, without: int = -1) -> Iterator[Near]:
-        """The nodes within a way of a root, nearest first; the root itself comes first.
+        """The nodes within a path length of a root, nearest first; the root itself comes first.
 
         Args:
             root: dense index.
-            reach_m: longest way, metres.
+            reach_m: longest path, metres.
             without: an edge that is not walked along.
         """
         queue: list[tuple[float, int, int]] = [(0.0, root, -1)]
@@ -76,7 +76,7 @@ class Surroundings:
                 heapq.heappush(queue, (length_m, there, other))
 
     def connects(self, a: int, b: int, reach_m: float, without: int) -> bool:
-        """Whether a way of at most `reach_m` leads from one node to another without an edge."""
+        """Whether a path of at most `reach_m` leads from one node to another without an edge."""
         queue, known = [(0.0, a)], set[int]()
         while queue:
             way_m, node = heapq.heappop(queue)

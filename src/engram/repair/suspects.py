@@ -39,7 +39,7 @@ class Suspicion:
 
 
 def suspect(graph: ExperienceGraph, config: RepairConfig, gone: Collection[int] = ()) -> Suspicion:
-    """Adjusts the whole map robustly, and tells which edges it contradicts or does not confirm.
+    """Adjusts the whole map robustly, and reports the edges it contradicts or does not confirm.
 
     Args:
         graph: the graph.

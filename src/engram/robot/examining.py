@@ -30,7 +30,7 @@ _STRETCHES = 4
 
 
 def facts_of(sequence: DriveSequence, *, by_hour: bool = False) -> Facts:
-    """What is known of a drive beside its frames."""
+    """Facts about a drive in addition to its frames."""
     info = sequence.info
     step = sequence.frames.step if isinstance(sequence, ImageSequence) else 1
     bits = sequence.bits() if isinstance(sequence, ImageSequence) else None
@@ -79,7 +79,7 @@ def examine_drive(
 def _chosen(
     sequence: Drive, front: Front, most: int
 ) -> Iterator[tuple[Arrived, OutsideMotion | None]]:
-    """The frames that are examined; the front begins anew with each stretch of them."""
+    """The frames that are examined; the front starts again with each stretch of them."""
     source = sequence.motion()
     runs: Iterable[Iterable[Arrived]] = [islice(sequence, most)]
     if isinstance(sequence, ImageSequence):
@@ -168,7 +168,7 @@ class LookedAhead:
 
     @property
     def info(self) -> SequenceInfo:
-        """What is known of the drive as a whole."""
+        """Facts about the drive as a whole."""
         return self.sequence.info
 
     @property

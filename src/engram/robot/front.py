@@ -133,7 +133,7 @@ class Front:
 
     @property
     def doubts(self) -> int:
-        """Frames at which nothing told whether the camera or part of its image stood still."""
+        """Frames that leave open whether the camera or part of its image stood still."""
         return self._fixed.doubts
 
     def look_again(self) -> None:

@@ -62,7 +62,7 @@ class IslandsConfig:
 
 @dataclass(frozen=True, slots=True)
 class IslandReport:
-    """What became of the parts of a map.
+    """Result of joining the parts of a map.
 
     Attributes:
         revision: its number; None if nothing was joined.

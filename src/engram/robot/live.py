@@ -1,4 +1,4 @@
-"""Saving during a live drive: map or memory grow beside the robot's loop without delaying it."""
+"""Saving during a live drive: map or memory grow in parallel, without delaying the robot."""
 
 from __future__ import annotations
 

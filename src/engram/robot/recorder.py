@@ -1,4 +1,4 @@
-"""The flight recorder: a robot's last seconds, written when it is lost or somebody asks."""
+"""The flight recorder: a robot's last seconds, written when it is lost or on request."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ class Recorder:
         return path
 
     def close(self) -> None:
-        """Writes what was asked for, and ends the thread."""
+        """Writes what was requested, and ends the thread."""
         if self._thread is not None:
             self._queue.put(None)
             self._thread.join()

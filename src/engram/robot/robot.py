@@ -297,7 +297,7 @@ class Robot:
             self._followed(arrived, motion)
 
     def _followed(self, arrived: Arrived, motion: Motion) -> None:
-        """Notes a frame of which only the motion is known."""
+        """Records a frame that yields only motion."""
         followed = _unlocalised(stamp_of(arrived), motion, self._localiser.best_position)
         self.track = (*self.track[1 - _REMEMBERED :], followed)
 
@@ -478,7 +478,7 @@ def _since_placed(
 
 
 def _after(before: Motion, motion: Motion) -> Motion:
-    """Two successive motions as one; the second alone where one of them is not known."""
+    """Two successive motions as one; the second alone where one of them is unknown."""
     first, second = before.prev_from_curr, motion.prev_from_curr
     if first is None or second is None:
         return motion
@@ -492,6 +492,6 @@ def _after(before: Motion, motion: Motion) -> Motion:
 
 
 def _is_elsewhere(placed: Placed, motion: Motion) -> bool:
-    """Whether stamps went back and images do not go on: another drive, or a simulator's reset."""
+    """Whether stamps went back and images do not match: another drive, or a simulator's reset."""
     back = placed.step is not None and placed.step.by_ns < 0
     return back and motion.guessed_m > 0 and motion.odometry.status is not OdometryStatus.OK

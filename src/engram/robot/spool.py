@@ -1,4 +1,4 @@
-"""A drive's memory in a file beside the map, until the map's writer is free.
+"""A drive's memory in a file next to the map, until the map's writer is free.
 
 A robot that only remembers needs the map's writer at the end of its drive, not throughout: others
 may map meanwhile. So its path and attempts go to a separate file, which also survives a crash. The
@@ -119,7 +119,7 @@ class Spool:
 
 
 def commit_spools(map_path: Path) -> dict[Path, Revision]:
-    """Commits the memories beside a map, each as a session without nodes; says by which revisions.
+    """Commits the memories next to a map, each as a session without nodes; returns the revisions.
 
     Memories of running drives are left alone. Entries and attempts of nodes that the map no longer
     shows are left out.

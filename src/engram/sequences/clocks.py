@@ -323,7 +323,7 @@ class SteadyClock:
         return _is_far(a, b, self._usual_ns(inf))
 
     def _going_on(self, stamp: _Stamp) -> list[_Stamp] | None:
-        """The stamps that have their place now; None while that is not known."""
+        """The stamps whose places are settled; None while they are not."""
         last, known = self._last, [*self._waiting, stamp]
         if last is None:
             return self._beginning(known) if self._waits else [stamp]
@@ -441,7 +441,7 @@ class SteadyClock:
             self._count_fault(one, before[-1] if before else self._last or after)
 
     def _count_fault(self, stamp: _Stamp, beside: _Stamp | None) -> None:
-        """Counts a stamp that is left out, by the one beside it that has a place."""
+        """Counts a stamp that is left out, by its neighbour that has a place."""
         by_ns = 0 if beside is None else stamp.stamp_ns - beside.stamp_ns
         fault = StampFault.AHEAD if by_ns > 0 else StampFault.EARLY
         fault = StampFault.REPEATED if by_ns == 0 else fault

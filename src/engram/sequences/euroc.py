@@ -39,7 +39,7 @@ def is_euroc(path: Path) -> bool:
 
 
 def is_tumvi(path: Path) -> bool:
-    """The same layout with `dso/camchain.yaml` beside `mav0`."""
+    """The same layout with `dso/camchain.yaml` next to `mav0`."""
     return _has_cameras(path) and tumvi_calibration(path).is_file()
 
 

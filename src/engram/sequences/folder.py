@@ -129,7 +129,7 @@ def _places(path: Path, options: OpenOptions) -> Listing:
 
 
 def _named_alike(left: Path, right: Path) -> list[dict[str, Path]]:
-    """The images of both sides by name, without the words that tell the sides.
+    """The images of both sides by name, without the words for the sides.
 
     Raises:
         SequenceError: no image has a partner.

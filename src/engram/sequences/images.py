@@ -113,7 +113,7 @@ def image_bits(path: Path) -> int | None:
 
 
 def header_size(content: bytes) -> tuple[int, int] | None:
-    """Width and height that an image's header claims, px; None for what is no known image."""
+    """Width and height that an image's header claims, px; None if the format is unknown."""
     for begins, size_in in _SIZES:
         if content.startswith(begins):
             try:

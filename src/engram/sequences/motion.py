@@ -49,7 +49,7 @@ class Sample:
 
 @runtime_checkable
 class MovedSequence(Protocol):
-    """A drive that may know its motion from outside."""
+    """A drive that may contain its motion from outside."""
 
     def motion(self) -> MotionSource | None:
         """A new pass through the motion from outside; None without one."""
@@ -187,7 +187,7 @@ def read_samples(path: Path) -> list[Sample]:
 
 
 def timed_samples(path: Path) -> tuple[list[Sample], StampReport]:
-    """The samples of a file by rising time, and what became of their stamps.
+    """The samples of a file by rising time, and the report on their stamps.
 
     Raises:
         SequenceError: it is of no known kind, malformed, or empty, or most of its stamps are wrong.

@@ -79,7 +79,7 @@ def _stamped(side: Path) -> list[StampedFile]:
 
 
 def _without_lone(places: Listing) -> Listing:
-    """Places of pairs: traversals lack single images here and there, by their documentation."""
+    """Places of pairs: single images are missing from traversals, by their documentation."""
     pairs = [place for place in places if isinstance(place, PairFiles | WrongStamp)]
     return pairs or places
 

@@ -45,7 +45,7 @@ class StereoSequence(Protocol):
 
     @property
     def info(self) -> SequenceInfo:
-        """What is known of the drive as a whole."""
+        """Facts about the drive as a whole."""
         ...
 
     @property
@@ -83,7 +83,7 @@ class FrameSequence(Protocol):
 
     @property
     def info(self) -> SequenceInfo:
-        """What is known of the drive as a whole."""
+        """Facts about the drive as a whole."""
         ...
 
     @property

@@ -22,5 +22,5 @@ class Check:
 
 
 def unmet(checks: Iterable[Check]) -> list[str]:
-    """The demands that are not met, each with what was found; a test asserts that there is none."""
+    """The unmet demands, each with what was found; a test asserts that the list is empty."""
     return [f"{one.demand}: {one.found}" for one in checks if not one.met]

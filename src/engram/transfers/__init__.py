@@ -1,4 +1,4 @@
-"""Maps on the wire: pages of rows and blobs, each known by its SHA-256."""
+"""Maps on the wire: pages of rows and blobs, each named by its SHA-256."""
 
 from engram.transfers.bundles import Unbundler, bundle
 from engram.transfers.join import MissingPartError, join

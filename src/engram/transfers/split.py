@@ -18,7 +18,7 @@ from engram.transfers.pages import BLOBS, PartHash, encode_pages, part_hash
 
 @dataclass(slots=True)
 class Split:
-    """A map and its parts. Blobs stay in the map and are read when they are asked for.
+    """A map and its parts. Blobs stay in the map and are read when requested.
 
     Attributes:
         location: the map file.

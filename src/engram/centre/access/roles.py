@@ -12,7 +12,7 @@ ALL_MAPS = "*"
 
 
 class Role(StrEnum):
-    """What somebody is on a map."""
+    """Role of a person or robot on a map."""
 
     VIEWER = "viewer"  # reads the map, its history and the state of the fleet
     ROBOT = "robot"  # downloads, its own hand-ins and reports

@@ -61,7 +61,7 @@ def takes(*roles: Role) -> Any:
 def page_of(
     items: list[dict[str, Any]], limit: int, cursor: Callable[[dict[str, Any]], object]
 ) -> dict[str, Any]:
-    """A page of a list that was asked for with one item more than its limit."""
+    """A page of a list that was read with one item more than its limit."""
     more = len(items) > limit
     shown = items[:limit]
     return {"items": shown, "next": str(cursor(shown[-1])) if more and shown else None}

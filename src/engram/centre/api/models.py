@@ -299,7 +299,7 @@ class Health(BaseModel):
 
 
 class Problem(Open):
-    """Problem details of RFC 9457: why a request is not served."""
+    """Problem details of RFC 9457: why a request failed."""
 
     type: Annotated[str, Field(examples=["about:blank"])]
     title: Annotated[str, Field(examples=["Changed meanwhile"])]

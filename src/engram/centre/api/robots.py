@@ -80,7 +80,7 @@ def follow(name: str, robot: str, body: models.Following, centre: CentreHere, wh
 
 @router.delete("/maps/{name}/robots/{robot}", status_code=204, dependencies=[takes(Role.ADMIN)])
 def take_away(name: str, robot: str, centre: CentreHere, who: Asking) -> None:
-    """Takes a robot's tokens for good."""
+    """Revokes a robot's tokens permanently."""
     Fleet(centre).wanted(name, robot)
     disable(centre, robot, who.id)
 

@@ -67,7 +67,7 @@ def handins(
 
 @router.get("/handins/{handin}", response_model=models.HandIn)
 def one_handin(handin: str, centre: CentreHere, who: Asking) -> dict[str, Any]:
-    """A hand-in, and the parts that it still lacks."""
+    """A hand-in, and its missing parts."""
     return _shown(centre, _handin(centre, who, handin, Role.VIEWER))
 
 
@@ -171,7 +171,7 @@ def dreams(name: str, centre: CentreHere) -> list[dict[str, Any]]:
 
 @router.post("/dreams/{dream}/cancel", response_model=models.Dream)
 def cancel_dream(dream: str, centre: CentreHere, who: Asking) -> dict[str, Any]:
-    """Ends a dream; asked for again, it goes on where it was."""
+    """Cancels a dream; requested again, it continues where it stopped."""
     row = Dreams(centre).get(dream)
     if who.role_on(row["map"]) is None:
         raise UnknownError(f"there is no dream {dream!r:.40}")
@@ -223,7 +223,7 @@ def artifact_parts(
 def artifact_file(
     artifact: str, request: Request, centre: CentreHere, who: Asking
 ) -> StreamingResponse:
-    """The whole map file, with ranges, for clients that know only files."""
+    """The whole map file, with ranges, for clients that handle only files."""
     key = Downloads(centre).file_key(_granted(centre, who, artifact))
     size = centre.objects.size(key)
     start, stop = _range(request.headers.get("range"), size)
@@ -242,7 +242,7 @@ def artifact_file(
 
 
 def _range(asked: str | None, size: int) -> tuple[int, int]:
-    """First byte and end of a range; the whole where none, or none that makes sense, is asked."""
+    """First byte and end of the requested range; the whole file if it is missing or invalid."""
     unit, _, span = (asked or "").partition("=")
     first, dash, last = span.partition("-")
     digits = first.isascii() and first.isdecimal() and (not last or last.isdecimal())
@@ -271,7 +271,7 @@ def _handin(centre: Centre, who: Subject, handin: str, role: Role | None = None)
 
 
 def _granted(centre: Centre, who: Subject, artifact: str) -> dict[str, Any]:
-    """An artifact that somebody asked for and may still read.
+    """An artifact that the caller requested and may still read.
 
     Raises:
         UnknownError: there is none, or not for them.

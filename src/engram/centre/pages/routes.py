@@ -183,7 +183,7 @@ def robots(name: str, centre: CentreHere, who: Asking) -> Response:
 
 @router.get("/maps/{name}/queue", dependencies=VIEWERS)
 def queue(name: str, centre: CentreHere, who: Asking) -> Response:
-    """Hand-ins and downloads, and what became of them."""
+    """Hand-ins and downloads, with their results."""
     rows = HandIns(centre).listed(name, None, None, 2**62, _SHOWN)
     asked = [row for row in Downloads(centre).asked() if row["map"] == name]
     jobs = [{**row, "report": _report(row)} for row in rows]

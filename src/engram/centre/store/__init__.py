@@ -1,1 +1,1 @@
-"""What the service keeps beside the maps: its tables, and its objects."""
+"""What the service stores in addition to the maps: its tables and objects."""

@@ -150,7 +150,7 @@ def first_row(connection: Connection, query: Select[Any]) -> dict[str, Any] | No
 
 
 class _SharedSync:
-    """Makes SQLite's log durable, after the turn: one sync serves all who committed before it.
+    """Makes SQLite's log durable, after the turn: one sync covers all earlier commits.
 
     SQLite syncs the log by itself only before it moves rows from there into the database.
 

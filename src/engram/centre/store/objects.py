@@ -42,7 +42,7 @@ class Objects(Protocol):
         ...
 
     def delete(self, key: str) -> None:
-        """Removes an object; one that is not there is none."""
+        """Removes an object; a missing one is no error."""
         ...
 
     def keys(self, prefix: str) -> Iterator[str]:

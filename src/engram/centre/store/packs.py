@@ -94,7 +94,7 @@ class Packs:
         return [one for one in some if one not in known]
 
     def read(self, wanted: Iterable[PartHash]) -> Iterator[tuple[PartHash, bytes]]:
-        """The wanted parts that are there, in the order in which they are asked for."""
+        """The requested parts that are there, in the order of the request."""
         batch: list[PartHash] = []
         for one in wanted:
             batch.append(one)

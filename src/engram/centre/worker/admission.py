@@ -102,7 +102,7 @@ def write_checked(manifest: Manifest, parts: dict[PartHash, bytes], path: Path) 
 
 
 def confine(memory_bytes: int, time_s: int, file_bytes: int) -> None:
-    """Limits this process for good, and takes its network away where the system allows."""
+    """Limits this process permanently, and cuts off its network where the system allows."""
     _lower(resource.RLIMIT_AS, memory_bytes, memory_bytes)
     _lower(resource.RLIMIT_CPU, time_s, time_s + 5)
     _lower(resource.RLIMIT_FSIZE, file_bytes, file_bytes)

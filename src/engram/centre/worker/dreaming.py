@@ -63,7 +63,7 @@ def dream_a_while(
 
 
 def _clear_left(centre: Centre, due: list[dict[str, Any]]) -> None:
-    """Removes what killed dreams left that will not go on: copies of all robots' maps."""
+    """Removes what killed dreams left that will not be resumed: copies of all robots' maps."""
     names = {f"dream-{row['id']}" for row in due}
     for folder in (centre.folder / "work").glob("dream-*"):
         if folder.name not in names:
@@ -112,7 +112,7 @@ def _dream_here(
 
 
 def dream_of(centre: Centre, row: dict[str, Any], scheduler: str | None = None) -> None:
-    """Dreams one dream to its end, which its row then tells.
+    """Runs one dream to its end, and records the result in its row.
 
     A map that somebody writes to by hand, or a full disk, leaves it asked for.
     """

@@ -89,7 +89,7 @@ def work(
 
 
 def _make_downloads(centre: Centre, hindered: list[EngramError]) -> int:
-    """Makes what robots asked for, unless something hinders it: merging may take less room."""
+    """Makes the requested downloads unless something hinders it: merging may take less room."""
     downloads, made = Downloads(centre), 0
     for name in {row["map"] for row in downloads.asked()}:
         with centre.lane(f"{name}.downloads") as is_ours:

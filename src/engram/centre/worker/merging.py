@@ -141,7 +141,7 @@ def _revision_of(path: Path, content_hash: str) -> int:
 
 
 def clear_scratch(centre: Centre, row: dict[str, Any]) -> None:
-    """Takes away what the merge of a hand-in leaves beside the maps if it dies."""
+    """Removes what a killed merge of a hand-in left next to the maps."""
     _clear(_thin_map(centre, row))
 
 

@@ -50,7 +50,7 @@ def fixed_share(seen: Evidence) -> float | None:
 
 
 def doubted(seen: Evidence) -> float | None:
-    """Share of the frames in which nothing told whether the robot or part of the image rested."""
+    """Share of frames that leave open whether the robot or part of the image stood still."""
     return seen.doubted / len(seen) if len(seen) >= seen.config.least_frames else None
 
 

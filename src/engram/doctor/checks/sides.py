@@ -113,7 +113,7 @@ def row_jump_px(seen: Evidence) -> float | None:
 
 
 def row_offset_px(seen: Evidence) -> float | None:
-    """Vertical offset that all pairs share; cannot be told of a pair of two instants.
+    """Vertical offset shared by all pairs; undetermined if pairs were taken at two instants.
 
     The larger of what a shift, a roll and a scale explain, and of what lies in parts of the image.
     """

@@ -32,7 +32,7 @@ def repeated(seen: Evidence) -> float | None:
 
 
 def steps(seen: Evidence) -> float | None:
-    """How often the clock was set; not forwards, which cannot be told from a pause."""
+    """How often the clock was set; not forwards, which cannot be distinguished from a pause."""
     shifts_ns = [0, *(one.shift_ns for one in (*seen.read.steps, *seen.taken.steps))]
     return float(sum(a != b for a, b in pairwise(shifts_ns)))
 
@@ -84,7 +84,7 @@ def hours_unknown(seen: Evidence) -> float | None:
 
 
 def hour_given_by(seen: Evidence) -> str:
-    """What makes the hour of the drive known."""
+    """The options that determine the hour of the drive."""
     facts = seen.facts
     nowhere = facts.zone is None and facts.longitude_deg is None
     asked = ["--recorded-at"] if facts.clock is not Clock.UTC else []

@@ -394,7 +394,7 @@ def _settled_order(
 
 
 def _judged_by(judge: JudgeOptions) -> str:
-    """Hash of the judging drives and the orders tried: the way in which an order was found."""
+    """Hash of the judging drives and the orders tried: how an order was found."""
     return judge.hash() + ("" if judge.orders is Orders.ALL else f"-{judge.orders}")
 
 

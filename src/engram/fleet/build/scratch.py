@@ -1,4 +1,4 @@
-"""The files of a build beside its fleet map: a killed build continues from them."""
+"""The files of a build next to its fleet map: a killed build continues from them."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ class Scratch:
         """Marks the build as complete and removes its maps unless they are to be kept.
 
         Raises:
-            MapError: the fleet map lacks a drive of the groups; nothing is removed.
+            MapError: a drive of the groups is missing from the fleet map; nothing is removed.
         """
         assert self.plan is not None
         missing = _missing(self.centre, self.plan)
@@ -273,8 +273,8 @@ class Scratch:
         if missing:
             raise ConfigError(
                 f"{self.folder} holds the groups' maps of an earlier build, which is complete, and "
-                f"{self.centre} lacks {len(missing)} of their sessions ({missing[0]}); move the "
-                "folder, or delete it"
+                f"{len(missing)} of their sessions are missing from {self.centre} ({missing[0]}); "
+                "move the folder, or delete it"
             )
 
     def _clear(self) -> None:
@@ -296,7 +296,7 @@ def sessions_of(centre: Path) -> frozenset[str]:
 
 
 def _missing(centre: Path, plan: BuildPlan) -> list[str]:
-    """Sessions of the groups that the centre lacks."""
+    """Sessions of the groups that are missing from the centre."""
     wanted = {session for group in plan.groups for session in group}
     return sorted(wanted - sessions_of(centre))
 

@@ -89,7 +89,7 @@ def _epochs(counts: PathCounts, options: DownloadOptions) -> tuple[list[int], di
 
 
 def _windows(asked_min: float, options: DownloadOptions) -> Iterator[float]:
-    """The asked width, then wider ones up to half a day; only the asked one if `strict`."""
+    """The requested width, then wider ones up to half a day; only the requested one if `strict`."""
     yield asked_min
     while not options.strict and asked_min < _WIDEST_MIN:
         asked_min = min(asked_min + options.widen_min, _WIDEST_MIN)

@@ -43,7 +43,7 @@ class Weather(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """What the map knows of the mission's light.
+    """Whether the map contains drives in the mission's light.
 
     Attributes:
         alike: whether some drive of the map had the same; None if that is unknown.

@@ -1,4 +1,4 @@
-"""What a download carries beside records: removed edges, places in the map frame, goals."""
+"""What a download carries in addition to records: removed edges, placed nodes, goals."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def _try_far_away(far: _FarTry, monitor: Monitor) -> tuple[bool, Mapping[str, by
 
 
 def _whole_maps(paths: Sequence[Path]) -> list[bytes]:
-    """The maps' files, without a write-ahead log beside them."""
+    """The maps' files, without a write-ahead log next to them."""
     with tempfile.TemporaryDirectory(prefix="engram-dream-") as folder:
         made = []
         for number, path in enumerate(paths):

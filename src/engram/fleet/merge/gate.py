@@ -62,7 +62,7 @@ def check_held_out(
 
 
 def held_as(sequence: DriveSequence, sessions: Sequence[Session]) -> Session | None:
-    """The session of this drive, whatever the robot was called; None if the map lacks it.
+    """The session of this drive, whatever the robot's name; None if it is not in the map.
 
     Raises:
         SequenceError: the drive cannot be read.

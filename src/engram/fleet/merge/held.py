@@ -30,7 +30,7 @@ class Held:
     attempts: list[Attempt]
 
     def withdrawn(self, *, is_the_fix: bool) -> None:
-        """The position is unknown; of the disproved fix also the match is none."""
+        """Drops the position; for the disproved fix, its match too."""
         self.found = replace(self.found, position=None)
         if is_the_fix:
             self.found = replace(

@@ -59,7 +59,7 @@ _AGREED = 5
 
 
 class Replay(Keeper):
-    """Replays segments one after another and adds what the fleet map lacks.
+    """Replays segments one after another and adds what is missing from the fleet map.
 
     Each segment is a drive of `Robot.step`, with this object as the keeper. What fixes on trial
     would omit or tie is held back until they have proved themselves.
@@ -274,7 +274,7 @@ class Replay(Keeper):
     def _known_neighbour(
         self, node: NodeId, kinds: frozenset[EdgeKind], before: int | None = None
     ) -> Position | None:
-        """Position of a node, by its edge of least variance to nodes that the fleet map knows.
+        """Position of a node, by its edge of least variance to nodes of the fleet map.
 
         Args:
             node: of the robot's map.

@@ -78,6 +78,6 @@ class MergeOptions(MergeSettings):
 
     @classmethod
     def of(cls, settings: MergeSettings, author: str | None = None) -> MergeOptions:
-        """These settings, merged in somebody's name."""
+        """These settings, with the author of the merge."""
         values = {one.name: getattr(settings, one.name) for one in fields(MergeSettings)}
         return cls(**values, author=author)

@@ -112,7 +112,7 @@ class Merge:
         )
 
     def lacks_edge(self, edge: Edge) -> bool:
-        """Whether two of the fleet map's nodes lack this edge; a bridge adds nothing to others."""
+        """Whether this edge is missing between two nodes of the fleet map; False for bridges."""
         return (
             edge.kind is not EdgeKind.BRIDGE
             and edge.a in self.graph
@@ -134,7 +134,7 @@ class Merge:
                 yield one
 
     def new_goals(self) -> Iterator[Goal]:
-        """The robot's goals at known nodes, by names that the fleet map lacks.
+        """The robot's goals at known nodes, under names that are new to the fleet map.
 
         One that was removed from the fleet map stays removed.
         """
@@ -147,7 +147,7 @@ class Merge:
                     yield found
 
     def lacks_omission(self, omitted: NodeId) -> Position | None:
-        """Position of a node that the robot's map had omitted; None if the fleet map knows it."""
+        """Position of a node that the robot's map omitted; None if the fleet map contains it."""
         omission = self.robot.omissions[omitted]
         known = self.equivalent(omission.node)
         if known is None or self.knows(omitted) or omitted in self.robot.graph:
@@ -212,7 +212,7 @@ class Merge:
         self.writer.add_omission(omission)
 
     def add_edge(self, edge: Edge) -> None:
-        """Adds an edge that the graph lacks, or replaces one of larger variance; no removed one."""
+        """Adds a missing edge, or replaces one of larger variance; never a removed one."""
         if edge in self.removed:
             return
         known = self.graph.find_edge(edge.a, edge.b, edge.kind)
@@ -229,7 +229,7 @@ class Merge:
             self.report.edges += 1
 
     def add_entries(self, entries: Iterable[PathEntry]) -> None:
-        """Adds the entries that the fleet map's paths lack."""
+        """Adds the entries that are missing from the fleet map's paths."""
         for entry in entries:
             new = self.new_entry(entry)
             if new is not None:

@@ -1,4 +1,4 @@
-"""MERGE: adds to the fleet map what it lacks of a robot's map (method §7, [G16] §V-A)."""
+"""MERGE: adds the missing parts of a robot's map to the fleet map (method §7, [G16] §V-A)."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ def _pose(transform: Any) -> SE3 | None:
 def read_infos(
     bag: Bag, decoder: Decoder, stereo: StereoTopics, size: tuple[int, int] | None = None
 ) -> tuple[CameraInfo, CameraInfo] | None:
-    """The first `CameraInfo` of each camera; None if the bag lacks one.
+    """The first `CameraInfo` of each camera; None if one is missing.
 
     Those that belong to the images by their names, or the only two that the bag has: the right one
     states the baseline.
@@ -223,7 +223,7 @@ def read_cameras(
         raise CalibrationError(
             f"{bag.path}: each image of {stereo.left} holds both sides, of {size[0]}×{size[1]} px; "
             "give the calibration of the two halves with --calibration FILE (Kalibr's "
-            "camchain.yaml, ROS's left.yaml beside right.yaml, OpenCV's, or calibration.toml)"
+            "camchain.yaml, ROS's left.yaml with right.yaml, OpenCV's, or calibration.toml)"
         )
     infos = read_infos(bag, decoder, stereo, size)
     if infos is None:
@@ -231,7 +231,7 @@ def read_cameras(
         also = f" (those of {', '.join(others)} belong to other topics)" if others else ""
         raise CalibrationError(
             f"{bag.path}: has no CameraInfo for {stereo.left} and {stereo.right}{also}; give the "
-            "calibration with --calibration FILE (Kalibr's camchain.yaml, ROS's left.yaml beside "
+            "calibration with --calibration FILE (Kalibr's camchain.yaml, ROS's left.yaml with "
             "right.yaml, OpenCV's, or calibration.toml)"
         )
     left, right = infos
@@ -287,7 +287,7 @@ def _optical(right_from_left: SE3, *frames: str) -> SE3:
 
 
 def _stream_pose(bag: Bag, decoder: Decoder, image: str) -> SE3 | None:
-    """The pose that RealSense's recorder states beside a stream's images."""
+    """The pose that RealSense's recorder stores with a stream's images."""
     topic = f"{image.removesuffix('/image/data')}/{_POSE_TOPIC}"
     message = next(_messages(bag, decoder, topic, _POSE), None)
     return None if message is None else _pose(message)

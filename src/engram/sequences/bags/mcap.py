@@ -83,7 +83,7 @@ class McapBag:
         self.is_ros1 = False
 
     def topics(self, lost: Report) -> dict[str, Topic]:
-        """The topics, from the summary, or if there is none from all chunks."""
+        """The topics, from the summary, or without one from all chunks."""
         contents = _Contents()
         with self._open() as file:
             if not self._read_summary(file, contents):
@@ -138,7 +138,7 @@ class McapBag:
         topics: Collection[str] | None,
         lost: Report,
     ) -> Iterator[Record]:
-        """Reads all chunks; fills `contents` on the way."""
+        """Reads all chunks, and fills `contents` from them."""
         end = os.fstat(file.fileno()).st_size
         file.seek(len(_MAGIC))
         while (at := file.tell()) < end:

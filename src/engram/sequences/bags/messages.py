@@ -123,5 +123,5 @@ def _header_ns(message: Any) -> int:
 
 
 def same_type(kind: str) -> str:
-    """The type's present name: ROS 1 has tf/tfMessage beside tf2_msgs/TFMessage."""
+    """The type's present name: ROS 1 has both tf/tfMessage and tf2_msgs/TFMessage."""
     return _TF if kind == "tf/msg/tfMessage" else kind

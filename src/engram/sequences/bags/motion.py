@@ -25,7 +25,7 @@ ODOMETRY, TWIST, IMU = (
 
 
 class BagMotion:
-    """The motion topics of a bag, and files beside it.
+    """The motion topics of a bag, and files given in addition.
 
     Args:
         bag: the bag.
@@ -62,7 +62,7 @@ class BagMotion:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Files beside the bag that it reads."""
+        """Files that it reads in addition to the bag."""
         return tuple(one for one in self._sources.values() if one not in self._bag.topics)
 
     def source(self, shift_ns: int) -> RigMotion | None:

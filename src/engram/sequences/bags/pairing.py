@@ -40,7 +40,7 @@ class Shot(Generic[T]):
 
 @dataclass(slots=True)
 class Pairing:
-    """What became of the images of a pass through the bag.
+    """Outcome of pairing the images in a pass through the bag.
 
     Attributes:
         tolerance_ns: largest offset of a pair.

@@ -41,7 +41,7 @@ class Ros1Bag:
         self.path = path
 
     def topics(self, lost: Report) -> dict[str, Topic]:
-        """The topics, from the index, or if there is none from all chunks."""
+        """The topics, from the index, or without one from all chunks."""
         with self._open() as file:
             try:
                 return self._indexed(file)
@@ -91,7 +91,7 @@ class Ros1Bag:
         topics: Collection[str] | None,
         lost: Report,
     ) -> Iterator[Record]:
-        """Reads all chunks; fills `connections` on the way."""
+        """Reads all chunks, and fills `connections` from them."""
         end = os.fstat(file.fileno()).st_size
         file.seek(len(_MAGIC))
         while (at := file.tell()) < end:
@@ -192,7 +192,7 @@ def _fields(header: bytes) -> Fields:
 def _field(fields: Fields, name: bytes, size: int) -> bytes:
     value = fields.get(name, b"")
     if len(value) != size:
-        raise DamageError(f"a header lacks {name.decode()}")
+        raise DamageError(f"{name.decode()} is missing from a header, or of the wrong size")
     return value
 
 

@@ -68,11 +68,11 @@ class StereoTopics:
 
     @property
     def are_numbered(self) -> bool:
-        """Whether numbers tell the cameras apart, so that either may be the left one."""
+        """Whether only numbers distinguish the cameras, so that either may be the left one."""
         return re.sub(r"\d", "", self.left) == re.sub(r"\d", "", self.right)
 
     def exchanged(self) -> StereoTopics:
-        """The same topics, the other way round."""
+        """The same topics, exchanged."""
         return StereoTopics(self.right, self.left)
 
     def __str__(self) -> str:
@@ -176,7 +176,7 @@ def _pairs(images: Collection[str]) -> Iterator[StereoTopics]:
 
 
 def partners(name: str) -> Iterator[str]:
-    """The names that the right camera's topic may have beside this one of the left camera."""
+    """The names that the right camera's topic may have, given that of the left camera."""
     for pattern, right in _PATTERNS:
         found = list(pattern.finditer(name))
         if found:
@@ -186,7 +186,7 @@ def partners(name: str) -> Iterator[str]:
 
 
 def _place(name: str) -> int:
-    """Where the word stands that tells the side."""
+    """Where the word for the side stands."""
     return next(found.start(2) for pattern, _ in _PATTERNS if (found := pattern.search(name)))
 
 
@@ -199,7 +199,7 @@ def _exchanged(right: str, found: re.Match[str]) -> str:
 
 
 def _best_of_each_rig(pairs: Collection[StereoTopics], prefer_raw: bool) -> list[StereoTopics]:
-    """One pair of topics for each rig: the part of the name before the camera's word tells rigs."""
+    """One pair of topics for each rig: the part of the name before the camera's word is the rig."""
     rigs: dict[str, StereoTopics] = {}
     for pair in sorted(pairs, key=lambda pair: (_rank(pair, prefer_raw), pair.left)):
         rigs.setdefault(pair.left[: _place(pair.left)], pair)
@@ -238,7 +238,7 @@ def _shared(one: str, other: str) -> int:
 
 
 def _info_beside(image: str, infos: Collection[str]) -> str | None:
-    """The topic beside an image topic or inside it, or the nearest above."""
+    """The topic next to an image topic or inside it, or the nearest above."""
     parts = image.removesuffix(_COMPRESSED).split("/")
     names = [f"{'/'.join(parts)}_camera_info", f"{'/'.join(parts)}_info"]
     for length in range(len(parts), 0, -1):

@@ -122,7 +122,7 @@ class FrameLog:
 
     @property
     def info(self) -> SequenceInfo:
-        """What is known of the drive as a whole; `format` is "framelog"."""
+        """Facts about the drive as a whole; `format` is "framelog"."""
         return replace(self._info, format="framelog")
 
     @property
