@@ -120,7 +120,7 @@ def _spread(value: Any) -> Any:
 def plain(value: Any) -> Any:
     """A value for JSON: dataclasses as objects, arrays as lists, ids and paths as text.
 
-    Not-a-number and infinities become None, as JSON lacks them.
+    Not-a-number and infinities become None, as JSON has none.
     """
     return msgspec.json.decode(_encode(_spread(value)))
 

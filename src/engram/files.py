@@ -1,6 +1,6 @@
 """Files that one process at a time writes, and new ones that appear whole or not at all.
 
-A new file is written as a draft beside its place and gets its name when nothing can fail any more.
+A new file is written as a draft next to its path and gets its name when nothing can fail any more.
 Whatever happens before leaves nothing under the name. What a killed process leaves of its draft
 goes away with the next draft for the same name.
 """
@@ -96,7 +96,7 @@ class WriterLock:
         holder: who holds it: this process.
 
     Raises:
-        MapLockedError: somebody else holds it; names process and host.
+        MapLockedError: another process holds it; names process and host.
         MapError: the lock file cannot be made, for example on read-only media, or something else,
             a symbolic link say, stands in its place.
     """

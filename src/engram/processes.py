@@ -181,7 +181,7 @@ def _hear(one: _Running, monitor: Monitor) -> None:
 def end_with_parent() -> None:
     """Ends this process as soon as its parent has ended, even by a kill.
 
-    Otherwise a worker would keep locks and write files beside the next run. Call it in the worker,
+    Otherwise a worker would keep locks and write files during the next run. Call it in the worker,
     whose work may end at any time.
     """
     parent = multiprocessing.parent_process()

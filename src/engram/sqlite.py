@@ -312,7 +312,7 @@ class SqliteFile:
             error = self.kind.strange
             fact = (
                 f"cannot be opened ({cause}); if it lies on read-only media with a file "
-                f"{self.path.name}-wal beside it, copy both to a writable folder"
+                f"{self.path.name}-wal next to it, copy both to a writable folder"
             )
         elif primary in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}:
             error = MapLockedError

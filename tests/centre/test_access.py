@@ -333,7 +333,7 @@ def test_a_person_or_robot_is_taken_away_by_name(site):
     take_away(site.centre, first.state.fact("robot"), "tests")
     first.step()
     second.step()
-    assert "was taken away" in str(first.trouble)
+    assert "was removed" in str(first.trouble)
     assert second.trouble is None
 
 

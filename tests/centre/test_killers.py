@@ -91,7 +91,7 @@ def test_whatever_is_raised_over_a_hand_in_ends_that_one_alone(site, monkeypatch
         site.work()
     state, error = state_of(site, killer)
     assert state == "failed"
-    assert error.startswith(f"a fault that Engram does not know, {fault.__name__}: ")
+    assert error.startswith(f"an unexpected fault, {fault.__name__}: ")
     assert len(error) < 400
     assert "Traceback" in caplog.text
     other = handed(site, "r2", 5_000)

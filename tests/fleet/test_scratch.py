@@ -146,7 +146,7 @@ def test_maps_that_were_kept_are_used_again_and_stay_while_nothing_is_new(begun,
 
 def test_maps_that_were_kept_and_are_nowhere_else_are_not_removed(begun, logs):
     begun.unlink()
-    with pytest.raises(ConfigError, match=r"lacks 2 of their sessions .* move the folder"):
+    with pytest.raises(ConfigError, match=r"2 of their sessions are missing .* move the folder"):
         build(begun, logs, "c", groups=1)
     assert (build_folder(begun) / "group-0.engram").exists()
 

@@ -81,7 +81,7 @@ class Outbox:
     def send(self, link: Link, durable_revision: int) -> bool:
         """Sends what is queued, oldest first; whether something was handed in.
 
-        What the centre does not know, as after a restored backup, is sent again. What it refuses
+        What is missing from the centre, as after a restored backup, is sent again. What it refuses
         for what it holds is not, and holds up nothing else.
 
         Raises:

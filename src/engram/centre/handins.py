@@ -1,7 +1,7 @@
 """Hand-ins: from a manifest to a job.
 
 A hand-in is its manifest, of one robot, on one map: begun twice it is the same. A part is its hash.
-A complete hand-in's row is the job; there is no queue beside it.
+A complete hand-in's row is the job; there is no other queue.
 """
 
 from __future__ import annotations

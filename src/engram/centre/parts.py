@@ -74,7 +74,7 @@ class Parts:
     def wanted(self, row: dict[str, Any]) -> list[PartHash]:
         """Parts that the robot has yet to send: pages first, then the blobs that they name.
 
-        Of frames only those of nodes that the fleet map lacks; it takes no others.
+        Of frames only those of nodes that are new to the fleet map; it takes no others.
         """
         if row["state"] != HandInState.OPEN:
             return []

@@ -139,7 +139,7 @@ class Centre:
             if name in self.map_names():
                 raise InputError(
                     f"{path} is missing, but merges into it are on record; restore it from a "
-                    "backup, and robots upload again what the backup lacks"
+                    "backup, and robots upload the rest again"
                 )
             Map.create(path).close()
         row = {

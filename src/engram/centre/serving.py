@@ -151,7 +151,7 @@ def _supervised_worker(centre: Centre) -> Iterator[None]:
             while process.is_alive() and not stop.wait(_RESTART_S):
                 pass
             if not stop.is_set():
-                _log.error("the worker ended, exit code %s; another one goes on", process.exitcode)
+                _log.error("the worker ended, exit code %s; a new one starts", process.exitcode)
             process.terminate()
             process.join()
 

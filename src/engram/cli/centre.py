@@ -137,7 +137,7 @@ def token(
         raise ConfigError(f"--role {role!r} is unknown; known: {', '.join(roles)}, {NONE}")
     with open_centre(folder, database) as centre:
         if role == NONE:
-            typer.echo(f"{name} is taken away: {', '.join(take_away(centre, name, BY))}")
+            typer.echo(f"access of {name} is revoked: {', '.join(take_away(centre, name, BY))}")
         else:
             print(add_person(centre, name, map_name, Role(role)))
 

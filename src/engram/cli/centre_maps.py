@@ -47,7 +47,7 @@ def map_(
 ) -> None:
     """Make a map, or change how its hand-ins are merged.
 
-    What is not given stays as it was; --set and --config give all settings of merging anew.
+    Options that are left out keep their values; --set and --config replace all settings of merging.
 
     \b
     Examples:

@@ -49,8 +49,8 @@ def dream(
     """Optimise a fleet map by held-out drives.
 
     Merges the robots' maps again, in other orders and with other settings, and compares the results
-    on held-out drives. If the drives then localise significantly better, what the best result has
-    and the fleet map lacks is added as one revision. Nothing is removed. The same command resumes
+    on held-out drives. If the drives then localise significantly better, what is new in the best
+    result is added to the fleet map as one revision. Nothing is removed. The same command resumes
     an interrupted search.
 
     \b

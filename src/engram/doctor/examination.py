@@ -94,7 +94,7 @@ class Evidence:
         rematched: how frames fit a map by other calibrations; of none without a map.
         alignments: of some pairs, worked out once at the end; None before.
         fixed_share: share of the image that moves with the camera.
-        doubted: frames at which nothing told whether the camera or part of its image stood still.
+        doubted: frames that leave open whether the camera or part of its image stood still.
     """
 
     config: DoctorConfig

@@ -23,7 +23,7 @@ class DoctorConfig:
         negative_share: largest share of left-right matches that lie to the right in the right
             image. Healthy drives stay below 0.2, swapped sides above 0.8.
         upright: least logarithm of how much further up than down the scene reaches.
-        forward_m: way between the instants of left and right image, metres.
+        forward_m: distance between the instants of left and right image, metres.
         row_jump_px: scatter of the vertical offset from pair to pair, px.
         row_offset_px, slight_row_offset_px: vertical offset of left and right image, px, RMS over
             the image: fatal, and a warning.

@@ -35,7 +35,7 @@ class Alignment:
     Attributes:
         offset_px: vertical offset, left minus right, at the principal point.
         slope_px: (2,) change of that over the width and the height of the image: roll and scale.
-        forward_m: way forwards from where the left image was taken to where the right one was.
+        forward_m: distance forwards from where the left image was taken to where the right one was.
         sigma_m: standard deviation of that.
         agreeing: the matches that agree.
     """

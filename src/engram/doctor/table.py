@@ -17,7 +17,7 @@ class Check:
     Attributes:
         code: name of its finding; two checks may share one, the first that alarms counts.
         severity: of its finding.
-        measure: the value; None if it cannot be told.
+        measure: the value; None if undetermined.
         limit: field of `DoctorConfig` that bounds the value, or the bound itself.
         unit: of the value.
         message: what is wrong beyond the limit, in words.
@@ -25,7 +25,7 @@ class Check:
         advice: the same in the light of what was seen; None where that tells no more.
         example: one of the things that are wrong, for the message.
         below: whether values below the limit are the alarm, not those above.
-        needs: what it would take to tell, for the report; "" if nobody need know.
+        needs: what the check would need, for the report; "" if not worth reporting.
         explains: codes whose findings would only be its consequences.
     """
 
@@ -132,7 +132,7 @@ CHECKS: tuple[Check, ...] = (
         below=True,
     ),
     Check(
-        "scale_off", _WARNING, motion.scale_off, "scale", "of the way",
+        "scale_off", _WARNING, motion.scale_off, "scale", "of the distance",
         "odometry and --motion disagree on distance: wrong focal length, baseline, or unit of the "
         "motion",
         "see that --motion is in metres and radians; calibrate again; check the baseline with a "
@@ -151,7 +151,7 @@ CHECKS: tuple[Check, ...] = (
         "are off by metres",
         "calibrate again, with images of this size; if it is the map that is wrong, map its "
         "first drives again",
-        needs="a map: engram localise tells it",
+        needs="a map: engram localise reports it",
     ),
     Check(
         "focal_length_off", _WARNING, optics.focal_too_short, "scale", "of the right one",
@@ -159,7 +159,7 @@ CHECKS: tuple[Check, ...] = (
         "are off by metres",
         "calibrate again, with images of this size; if it is the map that is wrong, map its "
         "first drives again",
-        needs="a map: engram localise tells it",
+        needs="a map: engram localise reports it",
     ),
     Check(
         "baseline_off", _WARNING, optics.baseline_too_long, "scale", "of the right one",
@@ -167,7 +167,7 @@ CHECKS: tuple[Check, ...] = (
         "map better",
         "check the distance of the lenses with a ruler; calibrate again; if it is the map that is "
         "wrong, map its first drives again",
-        needs="a map: engram localise tells it",
+        needs="a map: engram localise reports it",
     ),
     Check(
         "baseline_off", _WARNING, optics.baseline_too_short, "scale", "of the right one",
@@ -175,7 +175,7 @@ CHECKS: tuple[Check, ...] = (
         "map better",
         "check the distance of the lenses with a ruler; calibrate again; if it is the map that is "
         "wrong, map its first drives again",
-        needs="a map: engram localise tells it",
+        needs="a map: engram localise reports it",
     ),
     Check(
         "stamps_backwards", _WARNING, stamps.faulty, 0, "frames",
@@ -229,8 +229,8 @@ CHECKS: tuple[Check, ...] = (
     ),
     Check(
         "stands_still_in_part", _WARNING, pictures.doubted, "doubted", "of the frames",
-        "part of the image stands still while the rest moves, and nothing tells which of them is "
-        "the world; no position rests on such frames",
+        "part of the image stands still while the rest moves, and it is open which of them is the "
+        "world; no position is taken from such frames",
         "give --motion with wheels or a gyroscope, or --mask with what is fixed to the camera in "
         "black",
     ),
@@ -276,7 +276,7 @@ CHECKS: tuple[Check, ...] = (
     ),
     Check(
         "low_resolution", _WARNING, optics.px_per_deg, "least_px_per_deg", "px per degree",
-        "few pixels per degree: landmarks further off cannot be told apart",
+        "few pixels per degree: landmarks further off cannot be distinguished",
         "use larger images or a narrower lens",
         below=True,
     ),

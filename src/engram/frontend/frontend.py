@@ -38,7 +38,7 @@ class FrontendConfig:
             low-contrast images give corners: the grid keeps the best of each cell, and noise
             fails the stereo match.
         second_threshold: least FAST score of a corner in a second look, grey levels, which replaces
-            the first one where this gave fewer landmarks than were asked for: rain, fog, dirt, the
+            the first one where this gave fewer landmarks than requested: rain, fog, dirt, the
             dark. It also measures disparities in the halved images, through what blurs one of them.
             0: no second look.
         side_difference: difference of brightness and contrast between the sides, as a share of the

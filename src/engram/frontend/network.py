@@ -2,7 +2,7 @@
 
 A patch of 48×48 px around each corner goes through three convolutions and a linear layer in 8-bit
 integers, whose signs are 192 bits. Light, season and weather change them far less than BRIEF; rain
-and small rooms favour BRIEF, of which 64 bits stand beside them.
+and small rooms favour BRIEF, of which 64 bits are added.
 """
 
 from __future__ import annotations

@@ -264,7 +264,7 @@ def _check_places(calibration: RawStereoCalibration) -> None:
     raise CalibrationError(
         f"{where}. If the images of left and right are in order, the pose is the inverse of what "
         "it must be, that of the left camera in the right one's frame: invert it; otherwise swap "
-        "the two cameras in the calibration. engram doctor tells whether the images are swapped"
+        "the two cameras in the calibration. engram doctor shows whether the images are swapped"
     )
 
 

@@ -129,7 +129,7 @@ def replace_after_removal(
     """Lays out what removed edges had put in a wrong place; everything else stays.
 
     The whole graph is adjusted from where it is. Nodes that this moves by more than
-    `PlacingConfig.moved_m` against the rest are laid out anew around those that stay.
+    `PlacingConfig.moved_m` against the rest are laid out again around those that stay.
     """
     poses = place(graph, placed, config)
     placing = _Placing.of(graph, config)
@@ -149,7 +149,7 @@ def anchor(
 ) -> Poses:
     """Lays out the anchored components again, with their anchors at their known positions.
 
-    Other components keep their shape, and stand beside.
+    Other components keep their shape, and are placed next to them.
     """
     poses = place(graph, placed, config)
     placing = _Placing.of(graph, config)

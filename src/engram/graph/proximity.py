@@ -2,7 +2,7 @@
 
 Two experiences that do not match each other may run in parallel for hundreds of metres. A robot
 localised in one of them needs the nodes of the other as candidates. So when a robot saves nodes on
-odometry alone beside known ones, each is joined to them by dead reckoning, with its uncertainty.
+odometry alone near known ones, each is joined to them by dead reckoning, with its uncertainty.
 Once a match ties the far end of the chain, the closure is distributed along it.
 """
 

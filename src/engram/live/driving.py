@@ -97,9 +97,9 @@ class Watcher(Protocol):
 
 
 class Driving:
-    """Takes frames whatever happens to the map, and says what went wrong.
+    """Takes frames whatever happens to the map, and reports what went wrong.
 
-    Odometry goes on over a switch of maps, an error and a map that cannot be opened. A position
+    Odometry continues over a switch of maps, an error and a map that cannot be opened. A position
     is kept over these, so vague that it only proposes where to look. One thread uses it.
 
     Args:
@@ -257,7 +257,7 @@ class Driving:
         """Closes robot and map, and so commits what was mapped; the next frame opens them again.
 
         Returns:
-            What became of the drive; "" if none was saved.
+            Outcome of the drive; "" if none was saved.
         """
         robot, self._robot = self._robot, None
         self._proposed = False
@@ -338,7 +338,7 @@ def _stamp_trouble(clock: SteadyClock, stamp_ns: int, steps: int) -> str:
         steps: how often the clock had been set before.
     """
     if len(clock.steps) > steps:
-        return f"{clock.steps[-1].text()}; the drive goes on"
+        return f"{clock.steps[-1].text()}; the drive continues"
     if clock.time_ns is None or not clock.newest_waits:
         return ""
     off_ms = (stamp_ns + clock.shift_ns - clock.time_ns) / 1e6

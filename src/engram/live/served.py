@@ -36,7 +36,7 @@ class Served:
 
     Args:
         path: where the socket's file is made, for its owner alone.
-        once: end with the first client, or if none comes within a minute: nobody is left who
+        once: end with the first client, or if none comes within a minute: nothing else
             would stop the process.
 
     Raises:

@@ -331,8 +331,8 @@ class Attempter:
     ) -> tuple[bool, bool]:
         """Whether a match is a localisation, and whether it would be one with a second.
 
-        Where somebody only said where the robot is, a second match may repeat the error of the
-        first: it confirms what would also be believed without that word.
+        Where the position was only supplied by the caller, a second match may repeat the error of
+        the first: it confirms what would also be accepted without that position.
         """
         acceptance, confirmed = self._acceptance, candidate.standing.agreed > 0
         if match.inliers < acceptance.min_inliers or not determined(match, acceptance):

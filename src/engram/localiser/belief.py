@@ -2,7 +2,7 @@
 
 One frame may look like several places; several frames along a stretch of road seldom do. The filter
 adds each frame's evidence to that of earlier frames, which odometry carries along the edges of the
-graph. A failed match attempt counts against its node and the nodes beside it. The filter keeps the
+graph. A failed match attempt counts against its node and the nodes next to it. The filter keeps the
 best explanation of each node (Viterbi), not the sum over all: a sum over paths would favour nodes
 with many edges. It only orders the attempts; a match decides.
 

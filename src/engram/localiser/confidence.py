@@ -2,13 +2,14 @@
 
 A street repeats: lamps, trees and kerb stones match one period off with twenty to thirty inliers,
 consistently and with small covariances. So the number of inliers says little by itself. It counts
-against what is usual for this camera, light and distance, and beside how well the robot's position
-was known before: a position that fixes have confirmed again and again supports a weak match, a hint
-that nothing has confirmed yet supports none.
+against what is usual for this camera, light and distance, and together with how well the robot's
+position was known before: a position that fixes have confirmed again and again supports a weak
+match, a hint that nothing has confirmed yet supports none.
 
 The model is additive. A match has several readings: as what the position predicts, if fixes have
-confirmed it; the same if the match is weak or later fixes failed to come; as what somebody said;
-and as that of a robot that may be anywhere. A calibration makes log-odds of their sums that hold.
+confirmed it; the same if the match is weak or later fixes are missing; as one near a position that
+the caller supplied; and as that of a robot that may be anywhere. A calibration makes log-odds of
+their sums that hold.
 `CONFIDENCES` holds both for each kind of features, made and judged by ``python -m
 engram_lab.fits.confidence``.
 """
@@ -207,7 +208,7 @@ class Calibration:
     """Log-odds that hold, from a sum of terms.
 
     What is wrong among the surest matches is seldom another place: it is the right one in rain, and
-    a pose a metre off. No term foretells that, so where matches are believed claims grow more
+    a pose a metre off. No term predicts that, so among accepted matches the log-odds grow more
     slowly.
 
     Attributes:
@@ -231,7 +232,7 @@ class ConfidenceModel:
         doubted: of `Evidence.doubted_terms`.
         told: of `Evidence.told_terms`.
         anywhere: of `Evidence.anywhere_terms`.
-        witness: what a second match adds that agrees from some way on.
+        witness: what a second match adds that agrees some distance later.
         weak_inliers: matches of fewer must spread even near a confirmed position: a robot that is
             carried elsewhere unseen meets look-alikes there, low in the image.
         calibration: of the sums.

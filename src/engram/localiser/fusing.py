@@ -27,7 +27,7 @@ class Track:
         earlier_doubt: see `LocaliserConfig`.
 
     Attributes:
-        measured: by the last match, saved node, or word of somebody; None if unknown.
+        measured: by the last match, saved node or caller; None if unknown.
         best: by the matches before it, too.
     """
 

@@ -4,7 +4,7 @@ Such a match is too weak, or contradicts the estimated position. It may be corre
 parked alike in two streets. Correct matches agree with each other while the robot drives on: the
 position of the first, carried on by odometry, predicts that of the second. So the match waits,
 later frames attempt the nodes near it, and the next match that agrees with it is accepted. Of a
-robot that found nothing for long, matches must agree one after another over a longer way.
+robot that found nothing for long, matches must agree one after another over a longer distance.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class _Hypothesis:
 
     Attributes:
         position: where it says the robot is now.
-        driven_m: way since the match.
-        agreed_m: way before it along which others agreed with it.
+        driven_m: distance since the match.
+        agreed_m: distance before it over which others agreed with it.
     """
 
     position: Position

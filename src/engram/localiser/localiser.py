@@ -237,8 +237,8 @@ class Localiser:
             open_loop_m: distance driven since the last match with the map, metres; None keeps
                 the count.
             guessed_m: standard deviation of the motion guessed since then, metres.
-            agreed: number of fixes that confirm it; 0 for a position that is only said to be.
-            said: whether somebody says so, who may be wrong where the robot knew its place.
+            agreed: number of fixes that confirm it; 0 for a position that only the caller supplied.
+            said: whether the caller supplied it, which may be wrong if the robot was certain.
         """
         self._prover.forget(agreed, told_otherwise=said and self.certain)
         self._run.begin()

@@ -113,7 +113,7 @@ class LocaliserConfig:
         guide_below_m, guide_below_rad: the prediction guides an attempt if its standard deviations
             are below both; 0 turns guidance off. Source: `lab/reports/constants.md`.
         narrow_m, narrow_rad: standard deviations of a second search near the prediction, where the
-            first ends with few inliers or far from it; 0 m: there is none. Source:
+            first ends with few inliers or far from it; 0 m: no second search. Source:
             `lab/reports/trust.md`.
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
             They keep 98.7 % of the matches it would accept. Source: `lab/reports/constants.md`.
@@ -123,7 +123,7 @@ class LocaliserConfig:
         hypotheses: how weak matches of a lost robot are confirmed.
         basin, lessons: what the map's attempts say of distance, and of each node.
         matcher, acceptance: settings of the two halves of an attempt.
-        lookalikes: how runs of look-alikes are told.
+        lookalikes: how runs of look-alikes are detected.
     """
 
     search_radius_m: float = 8.0

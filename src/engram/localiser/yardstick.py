@@ -283,7 +283,7 @@ class Run:
         config: settings.
 
     Attributes:
-        believed: whether its matches are.
+        believed: whether its matches are accepted.
         proved: whether they showed, on the whole, what matches usually have.
     """
 

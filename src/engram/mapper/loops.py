@@ -132,7 +132,7 @@ class LoopSearch:
         attempter: makes attempts, as of a lost robot: there is no prediction.
         acceptance: thresholds by which two matches agree.
         config: settings.
-        yardstick: what matches in this map usually have; None: look-alikes are not told.
+        yardstick: what matches in this map usually have; None: look-alikes are not detected.
     """
 
     def __init__(
@@ -297,7 +297,7 @@ def edges_agree(
     """Whether the ways on both sides of two edges agree with what they say.
 
     Args:
-        graph: knows the way from `a` to `a`, and from `b` to `b`.
+        graph: contains the paths from `a` to `a`, and from `b` to `b`.
         first, second: edges between the same two parts of it.
         acceptance: disagreement that is allowed.
         certain_m: largest standard deviation of both ways; a long chain contradicts nothing.

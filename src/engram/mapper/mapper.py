@@ -84,7 +84,7 @@ class Mapper(Memory):
         saver: writes the additions.
         session: the drive.
         config: settings.
-        loops: closes loops beside the drive; None leaves them to the localiser's relocaliser.
+        loops: closes loops during the drive; None leaves them to the localiser's relocaliser.
         stored: what an interrupted run had stored of the session; None for a new one.
 
     Attributes:
@@ -135,7 +135,7 @@ class Mapper(Memory):
         """See `Keeper`.
 
         A robot whose nodes are connected to the map is not lost, however far it drifts: loop
-        closure runs beside the drive.
+        closure runs during the drive.
         """
         return not certain or self._loops is None or not self._joined
 

@@ -94,7 +94,7 @@ def check(database: SqliteDatabase, *, thin: bool = False) -> CheckReport:
 
     Args:
         database: of the map.
-        thin: whether nodes may lack their frames, as in a hand-in.
+        thin: whether frames of nodes may be missing, as in a hand-in.
     """
     checking = _Checking(database, thin)
     for fact in database.integrity_problems():

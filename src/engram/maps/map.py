@@ -132,7 +132,7 @@ class Map(MapWriter):
                 checkpoints. It is the map's only writer until it is closed. After a crash, the
                 robot's next such drive first commits the saved part (`Saving.recovered`).
             remembers: whether to store its path and match attempts, by which later drives rank;
-                implied by `maps`. They are kept in a file beside the map until the drive ends and
+                implied by `maps`. They are kept in a file next to the map until the drive ends and
                 no other process writes to the map.
             ranking: which nodes to try first: "recall", "path", "distance", …; key of
                 `engram.ranking.POLICIES`.

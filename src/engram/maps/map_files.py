@@ -53,7 +53,7 @@ def check_file(location: Path | str, *, thin: bool = False) -> CheckReport:
 
     Args:
         location: the map.
-        thin: whether nodes may lack their frames, as in a hand-in.
+        thin: whether frames of nodes may be missing, as in a hand-in.
 
     Raises:
         NotAMapError: the file does not exist or is not a map.
@@ -71,7 +71,7 @@ def check_file(location: Path | str, *, thin: bool = False) -> CheckReport:
 
 
 def _log_problems(path: Path) -> list[Problem]:
-    """Faults of a log that nobody writes to now."""
+    """Faults of a log that is not being written to."""
     path = path.resolve()
     if current_holder(path) is not None:
         return []

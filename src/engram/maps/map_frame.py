@@ -63,7 +63,7 @@ class FramePose:
 class MapFrame:
     """Where the nodes of a map lie: x, y horizontal and z up, metres.
 
-    Nodes keep their place from one revision to the next, unless somebody re-anchors the map or a
+    Nodes keep their place from one revision to the next, unless the map is anchored again or a
     repair shows that they were in a wrong place. Components whose relative pose is unknown stand
     side by side. Nothing localises by it.
 
@@ -112,8 +112,8 @@ class MapFrame:
     def goal(self, x_m: float, y_m: float, yaw_rad: float, name: str = "") -> Goal:
         """A pose in the map frame as a goal, which stays valid when the frame moves.
 
-        It is stored relative to the nearest node, rather to one that looks the same way. Height
-        and slope are the node's.
+        It is stored relative to the nearest node, rather to one that looks in the same direction.
+        Height and slope are the node's.
 
         Args:
             x_m, y_m: its position, metres.

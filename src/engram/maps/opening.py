@@ -13,7 +13,7 @@ from engram.maps.map import Map
 def open_map(path: Path | str, at: int | str | None = None, create: bool = False) -> Map:
     """Opens a map for localising, writing or reading.
 
-    Until it is written to, the map stays as it is now, whatever others commit: open it anew to see
+    Until it is written to, the map stays as it is now, whatever others commit: open it again to see
     later revisions. A robot stays with the map that it began in.
 
     Args:

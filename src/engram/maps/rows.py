@@ -269,7 +269,7 @@ def _robot_name(text: str) -> str:
     """The name of a robot.
 
     Raises:
-        MapCorruptError: it is none that Engram stores.
+        MapCorruptError: Engram stores no such value.
     """
     if not 0 < len(text) <= LONGEST_NAME:
         raise MapCorruptError(

@@ -117,7 +117,7 @@ class Speeds:
     def possible(self, step: Speed) -> bool:
         """Whether the robot may be as fast as a step says, by what is as strong as it.
 
-        The longer ago that was believed, the more the speed may have changed; less so by weak
+        The longer ago that was accepted, the more the speed may have changed; less so by weak
         steps. Steps that agree among themselves, as strong and as many as those that they
         contradict, overrule these.
         """
@@ -138,7 +138,7 @@ class Speeds:
         """Takes a step as true.
 
         Returns:
-            How far earlier ones that it refutes, and that nobody doubted, were wrong in all, m.
+            How far earlier undoubted steps that it refutes were wrong in all, m.
         """
         refuted_m = 0.0
         while self._learnt and step.seconds > 0:

@@ -6,7 +6,7 @@ stands, and what is far away on a straight road. Two things tell them apart. Lan
 their pixels *defy* the motion that all the others agree on only if that motion would have moved
 them, at their depth. And who is right, the ones that rest or the others, is decided by wheels and
 gyroscope; without them by depth, since what is fixed to a robot lies in front of the world; and
-otherwise by nobody: then no claim rests on either.
+otherwise it is left open: then neither is used.
 
 Cells of the image whose landmarks defied the motion again and again are learnt as fixed, and
 forgotten when their landmarks move like the others.
@@ -185,7 +185,7 @@ class FixedPixels:
         matcher: how frames are matched.
 
     Attributes:
-        doubts: looks at which nothing told who is right.
+        doubts: looks that left open which of the two is right.
     """
 
     def __init__(

@@ -133,7 +133,7 @@ class StandsStill:
 
         Args:
             seen: prev_from_curr by odometry; None if it failed.
-            told: the same motion by a source that is trusted; None if there is none.
+            told: the same motion by a trusted source; None without one.
         """
         if seen is None or told is None:
             self._begin()
@@ -161,7 +161,7 @@ def rests(told: OutsideMotion | None, config: FrozenConfig) -> bool:
     """Whether wheels say that the robot stands.
 
     Args:
-        told: the motion from frame to frame by a source that is trusted; None if there is none.
+        told: the motion from frame to frame by a trusted source; None without one.
         config: the limits.
     """
     if told is None or not told.has_way:

@@ -250,12 +250,12 @@ class GapFiller:
     - A measurement that needs an impossible acceleration counts as missing. At night in rain, the
       robot's own headlamps on the road make it seem to stop at once, with a small covariance. The
       longer ago the speed was measured, the larger the change allowed. Only steps as strong as it
-      may tell (`Speeds`).
-    - The first weak measurements of a drive, and those that go on where they had contradicted
+      may decide (`Speeds`).
+    - The first weak measurements of a drive, and those that follow others which contradicted
       strong ones, are guesses that may be wrong by their whole length, until strong ones come.
     - Where wheels and gyroscope agree with a measurement that is vaguer, both are weighed.
     - The covariance of measured steps grows with the share of missing steps among the newest, and
-      by the way that earlier ones, refuted by it, were wrong.
+      by the distance that earlier ones, refuted by it, were wrong.
     - Errors of guesses and vague steps in a row have one cause, and add up: at night in rain all
       are too short. Among them the robot may be as fast as when odometry was last sharp.
     - A robot that starts its drive moving, without a measured step, has no known speed. Its first

@@ -97,7 +97,7 @@ class OutsideMotion:
     Attributes:
         prev_from_curr: pose of the camera at this frame in that at the previous frame, metres.
         seconds: time between the two.
-        has_way: whether the wheels measured the way; else the translation is 0 and means nothing.
+        has_way: whether the wheels measured distance; else the translation is 0, without meaning.
         rates_rad_s: (3,) float64 mean rate of the gyroscope in the camera's axes; None if the turn
             is the wheels'.
     """
@@ -362,7 +362,7 @@ class OutsideModel:
     def corrected(self, motion: OutsideMotion) -> OutsideMotion:
         """A motion without the gyroscope's bias, as far as that is known.
 
-        The bias turns the way by half of what it turns the end.
+        The bias turns the translation by half of what it turns the end.
         """
         if motion.rates_rad_s is None:
             return motion

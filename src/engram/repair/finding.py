@@ -116,7 +116,7 @@ def find_wrong_edges(
     """Finds the edges of a map that join what does not belong together.
 
     The whole map is adjusted robustly: edges that then lie far off contradict it. Other edges are
-    confirmed by a short second way between their ends. What neither contradicts nor confirms, such
+    confirmed by a short second path between their ends. What neither contradicts nor confirms, such
     as the only link between two components, is looked at again: nodes around both ends are matched,
     and drives that crossed it are counted.
 

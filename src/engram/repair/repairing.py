@@ -92,7 +92,7 @@ def check_geometry(
     Args:
         path: the map.
         config: settings.
-        placing: how what the wrong edges had put in a wrong place is laid out anew.
+        placing: how nodes that the wrong edges had misplaced are laid out again.
         author: commits a revision of this author in which the wrong edges no longer count; None
             changes nothing.
         pictures: folder for a picture of both sides of each edge; None for none.

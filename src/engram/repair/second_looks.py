@@ -23,7 +23,7 @@ class Look:
 
     Attributes:
         a, b: dense indices of the nodes.
-        way_m: way from the edge's ends to the nodes, the longer of the two, metres.
+        way_m: path length from the edge's ends to the nodes, the longer of the two, metres.
         apart_m: how far they lie apart, if the edge is right.
         inliers: of the match, 0 without one.
         off_m, off_rad: how far the match lies from what the edge says; infinite without one.

@@ -20,7 +20,7 @@ class Near:
 
     Attributes:
         node: its dense index.
-        way_m: length of the way to it along the edges, metres.
+        way_m: length of the path to it along the edges, metres.
         root_from_node: its pose in the root's camera.
     """
 

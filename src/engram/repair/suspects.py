@@ -25,7 +25,7 @@ class Suspicion:
         chi2: (E,) float64, the same squared, in units of its variance.
         measured: (E,) bool, edges that are measurements.
         contradicted: (E,) bool, measurements that the rest of the map contradicts.
-        confirmed: (E,) bool, measurements that a short other way between their ends confirms.
+        confirmed: (E,) bool, measurements that a short other path between their ends confirms.
         poses: the adjusted map.
     """
 

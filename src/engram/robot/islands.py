@@ -44,8 +44,8 @@ class IslandsConfig:
         turn_rad: largest difference of their headings.
         nearest: nodes of the other part that each node is compared with.
         attempts: most matches that are tried between two parts.
-        apart_m: least way between two matches that confirm each other. Source: that of loops.
-        certain_m: largest standard deviation of the ways between them.
+        apart_m: least distance between two matches that confirm each other. Source: that of loops.
+        certain_m: largest standard deviation of the distances between them.
     """
 
     sigmas: Annotated[float, Meta(gt=0, le=10)] = 3.0
@@ -157,7 +157,7 @@ class _Islands:
 
         Args:
             sigmas_m: of the anchors, by label of the parts that have some.
-            monitor: told of progress, and may cancel.
+            monitor: receives progress, and may cancel.
         """
         labels = self._graph.components()
         found: list[Edge] = []

@@ -120,7 +120,7 @@ class Into(Protocol):
         """Commits the drive as a revision.
 
         Args:
-            saving: is told what became of it.
+            saving: receives the outcome.
             well: whether everything was written so far.
 
         Raises:
@@ -290,7 +290,7 @@ class LiveDrive:
     Args:
         owner: the robot.
         into: where the session goes.
-        saving: whether anything is kept, and what became of earlier drives; None to begin.
+        saving: whether anything is kept, and the outcome of earlier drives; None to begin.
     """
 
     def __init__(self, owner: Owner, into: Into, saving: Saving | None = None) -> None:

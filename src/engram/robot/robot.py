@@ -175,8 +175,8 @@ class Robot:
 
         A frame with a wrong stamp (see `engram.sequences.clocks`) is not used: its result has the
         status `NO_ODOMETRY`, and its position is a guess. After two such frames that follow each
-        other the clock counts as set: the robot goes on from the third one, as its images do. Where
-        these do not go on, either, and the clock went back, it was carried elsewhere, as by `lose`.
+        other the clock counts as set: the robot continues from the third one if the images do. If
+        they do not, and the clock went back, it was carried elsewhere, as by `lose`.
         What it saves counts on in time; results and `pose_at` have the stamps of the frames.
 
         Args:

@@ -26,7 +26,7 @@ class Saving:
     Attributes:
         state: `FAILED` after a write error: the robot continues to localise, and what it had saved
             is kept; `SPOOLED` if another process writes to the map, so that the drive's memory
-            waits in a file beside it; `UNCOMMITTED` if the doctor found something fatal: a mapped
+            waits in a file next to it; `UNCOMMITTED` if the doctor found something fatal: a mapped
             session then waits for ``engram check --seal``.
         reason: why saving failed or was not committed, or where the memory waits.
         session: the drive.

@@ -78,8 +78,8 @@ class RobotOptions:
         deadline_ms: latest start of an attempt after its frame arrived. With None only the counts
             limit it, so that equal input gives equal results.
         relocaliser: key of `RELOCALISERS`, for a lost robot; None for none.
-        threads: most threads of the robot, its caller's included; None for one for each lane and
-            those beside. Without a deadline the results are the same with any number.
+        threads: most threads of the robot, its caller's included; None for one per lane and per
+            background task. Without a deadline the results are the same with any number.
         author: author of revisions; None for the robot.
         force: whether a drive with a fatal finding of the doctor is mapped all the same.
     """

@@ -49,7 +49,7 @@ class Spool:
     """Writes one drive's memory; a `PathWriter` of a session without nodes.
 
     Args:
-        map_path: the map; the file lies beside it.
+        map_path: the map; the file lies next to it.
         session: the drive.
         camera: its camera.
         made_by: kind of its descriptors, and hash of the front-end.

@@ -25,7 +25,7 @@ class SampleDrive:
     """A drive that ships.
 
     Attributes:
-        name: of its folder; its truth is in `NAME.truth.txt` beside that.
+        name: of its folder; its truth is in `NAME.truth.txt` next to that.
         about: when it was, in what weather, and where it leads.
     """
 

@@ -151,7 +151,7 @@ def check_sides(cameras: Cameras, pairs: Iterable[StereoPair], where: object) ->
     if len(shifts) < _ENOUGH:
         raise CalibrationError(
             f"{where}: are left and right swapped? the projections state a negative baseline, and "
-            "the images do not tell; exchange the two, or make P[3] of the right camera negative, "
+            "the images leave it open; exchange them, or make P[3] of the right camera negative, "
             "−fx·baseline"
         )
     if np.mean(np.array(shifts) < 0) > _EXCHANGED:

@@ -5,9 +5,9 @@ A stream's *time* rises whatever its clock does. As long as stamps rise, time is
 - **Faulty stamps** (zero, early, far ahead, repeated) go, and only they: the stamps after them go
   on from those before.
 - **A clock that was set** shows in three stamps that follow each other, but not those before. Then
-  a new stretch begins. Set forwards, its times are its stamps: a clock that was set cannot be told
-  from a pause, unless whoever received the messages noticed no pause. Set back, its times count on
-  from those before, and the difference is noted as a `ClockStep`.
+  a new stretch begins. Set forwards, its times are its stamps: this cannot be distinguished from a
+  pause, unless whoever received the messages noticed no pause. Set back, its times count on from
+  those before, and the difference is noted as a `ClockStep`.
 
 A reader of files waits for the stamps that decide, and loses none at a step. A live robot cannot
 wait, and loses two.
@@ -363,7 +363,7 @@ class SteadyClock:
     def _returns(self, stamp: _Stamp) -> bool:
         """Whether a stamp shows that the newest one with a place was a fault.
 
-        It goes on from before a jump; or only one has a place, which nothing has confirmed.
+        It continues from before a jump; or only one has a place, which nothing has confirmed.
         """
         before, last = self._before_jump, self._last
         assert last is not None

@@ -39,7 +39,7 @@ _CLOSEST_NS = 100_000
 # Digits of a time since 1970 in other units, and what makes ns of it.
 _UNITS = {13: ("ms", "000000"), 16: ("µs", "000")}
 _TIMES_NEEDED = (
-    "write times.txt beside left/ and right/, with one line for each pair: its time in seconds, "
+    "write times.txt next to left/ and right/, with one line for each pair: its time in seconds, "
     "such as 0.0, 0.1, 0.2 at 10 Hz"
 )
 
@@ -58,7 +58,7 @@ height = 370"""
 def is_folder(path: Path) -> bool:
     """A folder with `left/`, `right/` or `calibration.toml`, at least two of the three; or `both/`.
 
-    `images/` stands for `both/` beside a `calibration.toml`.
+    `images/` stands for `both/` next to a `calibration.toml`.
     """
     parts = (path / "left", path / "right", path / "calibration.toml")
     return sum(part.exists() for part in parts) >= 2 or _both(path) is not None

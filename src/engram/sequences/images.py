@@ -50,7 +50,7 @@ def read_image(
     Raises:
         SequenceError: the file is missing, cut short, not an image of a known type, or its size is
             not `width` × `height`.
-        ConfigError: one colour channel is asked for and the image is grey.
+        ConfigError: one colour channel is requested and the image is grey.
     """
     return grey(path, decoded(path, _read_bytes(path), (width, height)), channel)
 
@@ -84,7 +84,7 @@ def grey(
 
     Raises:
         SequenceError: its pixels are of another kind.
-        ConfigError: one colour channel is asked for and the image is grey.
+        ConfigError: one colour channel is requested and the image is grey.
     """
     return _one_channel(where, _eight_bit(where, image), channel)
 

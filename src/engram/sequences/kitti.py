@@ -149,7 +149,7 @@ class _Calibration:
             raise CalibrationError(
                 f"{self.path}: {left} and {right} give a baseline of {baseline_m:.6g} m, "
                 f"must be > 0: the fourth number of {right} must be −fx·baseline; change its sign, "
-                "and engram doctor tells whether the images are exchanged"
+                "and engram doctor shows whether the images are exchanged"
             )
         try:
             return StereoCamera(

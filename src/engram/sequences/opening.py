@@ -119,7 +119,7 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
             open_images(find_folder),
         ),
         "tum-vi": SequenceFormat(
-            "TUM-VI, mav0/cam0 and mav0/cam1 as in EuRoC, with dso/camchain.yaml beside mav0",
+            "TUM-VI, mav0/cam0 and mav0/cam1 as in EuRoC, with dso/camchain.yaml next to mav0",
             is_tumvi,
             open_images(find_tumvi),
         ),
@@ -318,7 +318,7 @@ def _asked_of(path: Path) -> str | None:
     return (
         f"{path}: has images in {images}, but not of a known layout; put those of the left camera "
         "into left/ and of the right one into right/, with the same names, or those that hold left "
-        "and right side by side into both/. Beside them write times.txt (one line per pair, "
+        "and right side by side into both/. Next to them put times.txt (one line per pair, "
         f"seconds) and calibration.toml. {_TEMPLATE_OF}"
     )
 

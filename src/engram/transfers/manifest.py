@@ -106,7 +106,7 @@ def decode_manifest(body: bytes) -> Manifest:
     """A whole manifest from its JSON.
 
     Raises:
-        MapCorruptError: it is none.
+        MapCorruptError: it is not a valid manifest.
     """
     try:
         return msgspec.json.decode(body, type=WireManifest).full(None)

@@ -1,7 +1,7 @@
 """Pages: some rows of one table, encoded.
 
 Rows are only ever added to a map, so a page that is full stays as it is: whoever has it once need
-not get it again. Pages begin anew wherever the rows so far fill one, which depends on these rows
+not get it again. Pages begin again wherever the rows so far fill one, which depends on these rows
 alone. Blobs (landmarks, thumbnails, vocabularies) are parts of their own; pages hold their hashes.
 """
 

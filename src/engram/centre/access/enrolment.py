@@ -130,7 +130,7 @@ def new_token(centre: Centre, robot: str, nonce: str, signature: bytes) -> str:
         connection.execute(delete(nonces).where(nonces.c.nonce == nonce))
         known = first_row(connection, select(subjects).where(subjects.c.id == robot))
     refused = NotAllowedError(
-        "no token: the robot is not known here, was taken away, or signed a nonce that has ended"
+        "no token: the robot is unknown here, was removed, or signed an expired nonce"
     )
     if row is None or row["expires_ns"] < now or known is None or known["disabled"]:
         raise refused

@@ -51,7 +51,7 @@ class Subject:
         """Refuses who has none of the roles on a map.
 
         Raises:
-            UnknownError: no role at all: that the map exists is not told.
+            UnknownError: no role at all: that the map exists is not revealed.
             NotAllowedError: another role.
         """
         role = self.role_on(name)

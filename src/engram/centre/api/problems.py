@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 # For the description of the API: any request can fail in this way.
 DESCRIBED: dict[int | str, dict[str, Any]] = {
     "4XX": {
-        "description": "The request is not served.",
+        "description": "The request failed.",
         "content": {MEDIA: {"schema": Problem.model_json_schema()}},
     }
 }

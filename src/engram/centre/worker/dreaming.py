@@ -1,7 +1,7 @@
 """Dreams, when nothing else is to do: given up for whatever a robot hands in or asks for.
 
 A dream runs in a process of its own at low priority, which may be killed at any moment: what was
-tried is kept beside the map, and the next one goes on from there.
+tried is kept next to the map, and the next one continues from there.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def _dream_here(
 def dream_of(centre: Centre, row: dict[str, Any], scheduler: str | None = None) -> None:
     """Runs one dream to its end, and records the result in its row.
 
-    A map that somebody writes to by hand, or a full disk, leaves it asked for.
+    A map that is being written to by hand, or a full disk, leaves the request pending.
     """
     dreams, policy = Dreams(centre), centre.policy(row["map"])
     options = DreamOptions(scheduler=scheduler, merging=policy.merge)

@@ -82,7 +82,7 @@ def work(
             _log.error("%s; tried again in %g s", centre.words_of(error), _AGAIN_S)
             wait(_AGAIN_S)
         except Exception:  # of what robots sent: the others' work goes on
-            _log.exception("a fault that Engram does not know; tried again in %g s", _AGAIN_S)
+            _log.exception("an unexpected fault; tried again in %g s", _AGAIN_S)
             wait(_AGAIN_S)
         else:
             wait(centre.settings.poll_s)

@@ -48,7 +48,7 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
 
     Raises:
         EngramError: what lies with the centre, and not with the hand-in, which waits: no space, a
-            map that somebody writes to, a held-out drive that is gone.
+            map that is being written to, a held-out drive that is gone.
     """
     handins = HandIns(centre)
     if row["tries"] >= centre.settings.merge_tries:
@@ -82,7 +82,7 @@ def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
         handins.end(row, HandInState.FAILED, error=centre.words_of(error))
     except Exception as error:  # a stranger's map may bring about any: it ends this hand-in alone
         _log.exception("%s: hand-in %s", row["map"], row["id"][:8])
-        fact = f"a fault that Engram does not know, {centre.fault_of(error)}"
+        fact = f"an unexpected fault, {centre.fault_of(error)}"
         handins.end(row, HandInState.FAILED, error=fact)
     else:
         _settle(centre, handins, row, outcome)

@@ -1,8 +1,8 @@
 """Removes packs whose parts no hand-in and no download needs any more.
 
 Kept are the parts of hand-ins that are under way or refused, of those that ended lately, of each
-robot's newest merged one, which its next one continues, and of downloads. What was swept is asked
-for again where it is needed again: `wanted` lists it, as nobody counts as having given it.
+robot's newest merged one, which its next one continues, and of downloads. What was swept is
+requested again where it is needed again: `wanted` lists it, as no robot counts as having sent it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def sweep_all(centre: Centre) -> None:
 def sweep(centre: Centre, name: str) -> int:
     """Removes the packs of one map that nothing needs, and empties those that little is needed of.
 
-    Uploads and downloads may go on: what is needed is looked up again in the transaction that
+    Uploads and downloads may continue: what is needed is looked up again in the transaction that
     forgets packs, and whoever stores parts looks in his whether those he found are still there.
     What was forgotten is deleted by the next sweep, so that readers and backups that looked before
     still find it.

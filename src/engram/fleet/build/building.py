@@ -179,7 +179,7 @@ def build_map(
 ) -> BuildReport:
     """Maps groups of drives side by side and merges them into a fleet map.
 
-    Intermediate maps are kept in ``CENTRE.build`` beside the fleet map until the build is complete:
+    Intermediate maps are kept in ``CENTRE.build`` next to the fleet map until the build is done:
     the same call after an interruption continues from there and gives the same map. An existing
     fleet map takes all groups, without the drives that it has in full. A new one begins as the
     first group's map.

@@ -103,7 +103,7 @@ def build_folder(centre: Path) -> Path:
 def sole_builder(centre: Path) -> Iterator[None]:
     """Locks a fleet map against other builds, which would write to the same groups' maps.
 
-    The lock file is beside the folder, since the folder is removed and made again. The lock ends
+    The lock file is next to the folder, since the folder is removed and made again. The lock ends
     with its process, so a killed build can continue at once.
 
     Raises:

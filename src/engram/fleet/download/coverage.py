@@ -78,7 +78,7 @@ class Demand:
         Args:
             stock: the centre.
             options: when the mission is.
-            where: (N,) nodes along its way; None for anywhere.
+            where: (N,) nodes along its route; None for anywhere.
         """
         places, place_of = _places(stock)
         weight = np.zeros((len(places), len(stock.sessions)))

@@ -41,7 +41,7 @@ def write_marks(writer: RevisionWriter, part: Part) -> None:
 
 
 def lacking_marks(part: Part, own: Map) -> list[Mark]:
-    """The marks of a part that a robot's map lacks; of places those of nodes new to it."""
+    """The marks of a part that are new to a robot's map; of places those of nodes new to it."""
     store, sent = part.stock.store, set(part.node_ids)
     lacking: list[Mark] = [
         removal

@@ -138,8 +138,8 @@ def check_options(options: DownloadOptions) -> None:
     """Refuses options that a selection would ignore.
 
     Raises:
-        ConfigError: the selection is unknown, does not use an option that was given, or lacks
-            another option that it needs with it.
+        ConfigError: the selection is unknown, does not use an option that was given, or needs
+            another option with it.
     """
     select = options.select
     if select not in SELECTIONS:

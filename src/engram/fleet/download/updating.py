@@ -1,6 +1,6 @@
 """A download taken into a map that the robot keeps ([G16] Fig. 3c and Fig. 9).
 
-The robot's map gains what the download has and it lacks, as one revision: nodes by UUID, edges by
+The robot's map gains what is new in the download, as one revision: nodes by UUID, edges by
 ends and kind, path entries by path and sequence, attempts by `Attempts.lacking`. Nothing is
 replayed and nothing is removed. The robot's own nodes that the fleet map omitted stay, and are tied
 to their equivalents. Killed at any moment, the map is as before or as after.
@@ -226,7 +226,7 @@ class _Update:
         return np.array([node not in known for node in self._stock.node_ids], np.bool_)
 
     def _lacking_edges(self) -> Iterator[Edge]:
-        """Edges that the robot's map lacks, or knows less exactly."""
+        """Edges that are missing from the robot's map, or less exact in it."""
         known = {_key(edge): uncertainty_m2(edge.covariance) for edge in self._own.edges}
         removed = Removed(self._map.removals)
         for edge in self._part.edges():
@@ -249,7 +249,7 @@ class _Update:
                     yield tie
 
     def _lacking_entries(self) -> Iterator[PathEntry]:
-        """Path entries that the robot's map lacks; those of merges by node and stamp."""
+        """Path entries missing from the robot's map; those of merges by node and stamp."""
         taken: dict[PathId, set[int]] = {}
         replayed = set()
         for entry in self._own.path_entries:

@@ -1,7 +1,7 @@
 """Tries orders and behaviours of merging, and adds what the best of them has ([G16] §IV and §V).
 
-The hand-ins are merged anew, in other orders and with other behaviours, and each result is judged
-by validation drives. The best one may improve the fleet map: what it has and the fleet map lacks
+The hand-ins are merged again, in other orders and with other behaviours, and each result is judged
+by validation drives. The best one may improve the fleet map: what is missing from the fleet map
 is added as one revision, if the drives then miss less of their route, beyond the interval of that
 difference. Nothing is removed, so that all nodes that robots refer to stay.
 """
@@ -84,12 +84,12 @@ class DreamOptions:
 
 @dataclass(slots=True, eq=False)
 class DreamReport:
-    """What came of a dream.
+    """Result of a dream.
 
     Attributes:
         centre: the fleet map.
         tried: results by behaviour; best order first.
-        complete: whether everything was tried; the same command goes on otherwise.
+        complete: whether everything was tried; otherwise the same command continues.
         behaviour, order: of the best result; order by numbers of the hand-ins.
         missed_before, missed_after: share of the validation drives' route without a match, in the
             fleet map and with what the best result adds.
@@ -148,7 +148,7 @@ def dream(
 ) -> DreamReport:
     """Looks for a better map in what robots handed in; adds it to the fleet map if it is better.
 
-    Results are kept in FLEET.dream: a dream that was stopped or killed goes on, and comes to the
+    Results are kept in FLEET.dream: a dream that was stopped or killed continues, and comes to the
     same result. They are removed once everything has been tried.
 
     Args:

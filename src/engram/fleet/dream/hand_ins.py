@@ -1,4 +1,4 @@
-"""Robots' maps as they were handed in, kept beside the fleet map for dreaming."""
+"""Robots' maps as they were handed in, kept next to the fleet map for dreaming."""
 
 from __future__ import annotations
 

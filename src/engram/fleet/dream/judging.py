@@ -42,7 +42,7 @@ def localised_in(
         monitor: receives progress, a step for each drive in each map, and may stop it.
 
     Returns:
-        For each map, what came of the drives, in their order.
+        For each map, the results of the drives, in their order.
 
     Raises:
         KeyboardInterrupt: the monitor stopped it.

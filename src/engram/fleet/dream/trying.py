@@ -1,4 +1,4 @@
-"""Tries ways of merging one beside another: in this process, in several, or on a Dask cluster."""
+"""Tries ways of merging in parallel: in this process, in several, or on a Dask cluster."""
 
 from __future__ import annotations
 

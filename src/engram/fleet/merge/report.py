@@ -222,7 +222,7 @@ class MergeReport:
         components: connected components of the fleet map afterwards.
         held_out: localisation of held-out drives before and after; None without a gate.
         moved: what moved in the map frame; None if the map is unchanged.
-        wrong_edges: wrong edges of the result; None if nobody looked.
+        wrong_edges: wrong edges of the result; None if they were not looked for.
         segments: one report each, in the order of replay.
         notes: warnings.
     """

@@ -92,7 +92,7 @@ def grey_of(
 
     Raises:
         SequenceError: its encoding is unknown, or its bytes do not fit.
-        ConfigError: one colour channel is asked for and the image is grey.
+        ConfigError: one colour channel is requested and the image is grey.
     """
     image = _pixels(message, where, size)
     if bits < 16 and image.dtype == np.uint16:

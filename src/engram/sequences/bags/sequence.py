@@ -69,7 +69,7 @@ class BagSequence:
         camera: its one camera, rectified.
         topics: where the images come from.
         transforms: the constant transforms that were found.
-        pairing: what became of the images, in the latest pass.
+        pairing: outcome of pairing the images, in the latest pass.
 
     Raises:
         SequenceError: the file cannot be read, or has no stereo pair of one instant.
@@ -215,7 +215,7 @@ class BagSequence:
 
         Raises:
             SequenceError: no pair can be used.
-            ConfigError: one colour channel is asked for and the images are grey.
+            ConfigError: one colour channel is requested and the images are grey.
         """
         self.pairing = Pairing(self.pairing.tolerance_ns)
         self._reasons.clear()

@@ -216,7 +216,7 @@ def _rank(pair: StereoTopics, prefer_raw: bool) -> tuple[bool, int, bool]:
 def info_topics(stereo: StereoTopics, infos: Collection[str]) -> StereoTopics | None:
     """The `camera_info` topics of a pair; None if the bag has not one for each camera.
 
-    They stand beside the images or above them, are named as the images are, or are the only two.
+    They are next to the images or above them, are named as the images are, or are the only two.
 
     Args:
         stereo: the image topics.
