@@ -252,7 +252,7 @@ def check_motion(motion: Motion | OutsideMotion) -> None:
     """Refuses a motion that no robot makes: its position would rest on it from then on.
 
     Raises:
-        InputError: it is no rigid motion, too long, or a number beside it is not finite, but for
+        InputError: it is not a rigid motion, too long, or another number is not finite, but for
             `Motion.guessed_m`: of a motion that nothing tells it is infinite.
     """
     shape: tuple[int, ...]
