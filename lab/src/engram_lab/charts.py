@@ -111,7 +111,7 @@ def draw_curves(
 
 
 def _draw_line(axes: Any, line: Line, colour: str, style: str, band: float) -> Any:
-    """With its band, as opaque as told; returns what the legend shows."""
+    """With its band, as opaque as given; returns what the legend shows."""
     if line.low is not None and line.high is not None:
         axes.fill_between(line.x, line.low, line.high, color=colour, alpha=band, linewidth=0)
         for edge in (line.low, line.high):  # bands of many lines hide each other, edges do not

@@ -1,4 +1,4 @@
-"""Robots that are wrong about where they are: told so, carried there unseen, or past a gap."""
+"""Robots with a wrong position: given to them, carried there unseen, or past a gap."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Try:
 
     @property
     def key(self) -> tuple[str, int, float, int]:
-        """What tells it apart."""
+        """What identifies it."""
         return self.kind.value, self.first, self.sigma_m, self.seed
 
 
@@ -224,7 +224,7 @@ class Street:
         return None if start is None else replace(start, covariance=spread)
 
     def _elsewhere(self, one: Try) -> int:
-        """A frame at least `OFF_M` from the first, seen the same way or not."""
+        """A frame at least `OFF_M` from the first, seen in the same direction or not."""
         apart_m = np.linalg.norm(self._at_m - self._at_m[one.first], axis=1)
         rng = np.random.default_rng([one.seed, one.first])
         return int(rng.choice(np.flatnonzero(apart_m >= OFF_M)))

@@ -30,7 +30,7 @@ class PlaceStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ColdStart:
-    """One frame that knew nothing of the frames before it.
+    """One frame, localised without the frames before it.
 
     Attributes:
         stamp_ns: of the frame.

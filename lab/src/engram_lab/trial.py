@@ -1,4 +1,4 @@
-"""Downloads tried out: what they promised beside what then happened on held-out drives.
+"""Downloads tried out: what they promised, and what then happened on held-out drives.
 
 The mission of each trial is that of the drive itself: its date and its hour of day.
 Source: [G16] Fig. 9 (nodes, time per localisation, failure); method §7 (the forecast).
@@ -157,7 +157,7 @@ def try_downloads(
     start: Callable[[Map], Position | None] = lambda _: None,
     left_out: Callable[[LeftOut], None] | None = None,
 ) -> list[Trial]:
-    """Download for each drive in each way, and localise it there without writing anything.
+    """Download for each drive by each method, and localise it there without writing anything.
 
     Args:
         centre: the map.
@@ -223,7 +223,7 @@ def _trial(
     nodes: Sequence[Node],
     asked: Mapping[str, Any],
 ) -> Trial:
-    """What came of a drive in a download."""
+    """Result of a drive in a download."""
     lookups_ms = [one.stage_ms["places"] for one in results if "places" in one.stage_ms]
     in_map_ms = [
         ms for one in results for stage, ms in one.stage_ms.items() if stage not in _BEFORE_THE_MAP

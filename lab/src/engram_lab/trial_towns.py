@@ -39,7 +39,7 @@ _LATER = (
 
 
 def longer_trial_town(seed: int) -> Campaign:
-    """The same town with nine more drives, the last three of them the other way round."""
+    """The same town with nine more drives, the last three of them in the opposite direction."""
     town = trial_town(seed)
     first = town.sessions[0]
     later = tuple(

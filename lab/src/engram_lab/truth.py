@@ -1,4 +1,4 @@
-"""Readers of ground truth: KITTI, EuRoC, TUM-VI, Oxford RobotCar, and that beside a frame log."""
+"""Readers of ground truth: KITTI, EuRoC, TUM-VI, Oxford RobotCar, and that of a frame log."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ TRUTH_SUFFIX = ".truth.txt"
 
 
 def truth_path(framelog: str | Path) -> Path:
-    """Path of a frame log's ground truth: NAME.truth.txt beside NAME.framelog."""
+    """Path of a frame log's ground truth: NAME.truth.txt next to NAME.framelog."""
     return Path(framelog).with_suffix(TRUTH_SUFFIX)
 
 
 def read_truth(framelog: str | Path) -> Trajectory | None:
-    """The ground truth beside a frame log, in TUM format; None if there is none.
+    """The ground truth next to a frame log, in TUM format; None if there is none.
 
     Raises:
         SequenceError: the file is malformed.

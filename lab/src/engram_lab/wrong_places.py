@@ -71,7 +71,7 @@ class WrongPlaces:
                     yield WrongPlace(frame, outcome)
 
     def believed(self, there: WrongPlace, usual_inliers: float = 0.0) -> Iterator[WrongPlace]:
-        """As by robots that believe to be where such a match is, with each deviation.
+        """As by robots whose position is where such a match is, with each deviation.
 
         Args:
             there: the match.

@@ -1,4 +1,4 @@
-"""The stages of `engram lab bench`, each timed beside the plain pipeline in the same run."""
+"""The stages of `engram lab bench`, each timed against the plain pipeline in the same run."""
 
 from engram_lab.bench.report import BenchReport, Machine, Side, StageResult
 from engram_lab.bench.runner import run_bench

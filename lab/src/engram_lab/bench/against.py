@@ -1,4 +1,4 @@
-"""Stages of this checkout beside those of another one, in blocks that alternate.
+"""Stages of this checkout against those of another one, in alternating blocks.
 
 Each side is a process of its own on the same core. Alternating call by call, the second side would
 find warm data and look 15 % too fast.

@@ -1,4 +1,4 @@
-"""The plain pipeline that stages are timed beside, where its libraries are at hand."""
+"""The plain pipeline that stages are timed against, where its libraries are at hand."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Side:
 
 @dataclass(frozen=True, slots=True)
 class StageResult:
-    """One stage beside its reference.
+    """One stage against its reference.
 
     Attributes:
         name: key in `STAGES`.

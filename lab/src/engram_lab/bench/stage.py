@@ -1,4 +1,4 @@
-"""What a stage is, and how its two sides are timed beside each other."""
+"""What a stage is, and how its two sides are timed against each other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stages of `engram lab bench`: the hot paths of a robot, each beside the plain pipeline."""
+"""The stages of `engram lab bench`: the hot paths of a robot, each against the plain pipeline."""
 
 from __future__ import annotations
 

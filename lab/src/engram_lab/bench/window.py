@@ -1,4 +1,4 @@
-"""Windowed joint optimisation on a problem of known solution."""
+"""Windowed joint optimisation on a problem with a known solution."""
 
 from __future__ import annotations
 

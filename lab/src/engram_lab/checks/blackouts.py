@@ -39,7 +39,7 @@ _WRONG_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What became of one blackout.
+    """Result of one blackout.
 
     Attributes:
         way_m: driven in the dark.
@@ -109,7 +109,7 @@ def trial(
 
 
 def _driven_m(truth: Sequence[SE3]) -> NDArray[np.float64]:
-    """(F,) way from the start to each frame, metres."""
+    """(F,) distance from the start to each frame, metres."""
     steps = [(truth[k - 1].inverse() @ truth[k]).distance_m for k in range(1, len(truth))]
     return np.concatenate([[0.0], np.cumsum(steps)])
 

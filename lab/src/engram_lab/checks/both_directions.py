@@ -1,4 +1,4 @@
-"""Both directions of a road: what drives either way miss after one drive each way.
+"""Both directions of a road: what drives in either direction miss after one in each.
 
     python -m engram_lab.checks.both_directions SEED SESSION...     # of `longer_trial_town`
     python -m engram_lab.checks.both_directions oxford 0 1 4 7 8 9 --mapped 0,1 8,9 4,7
@@ -82,7 +82,7 @@ def by_drive(found: Sequence[Missed], reverse: bool) -> Array:
 
 
 def apart(usual: Array, against: Array) -> Interval:
-    """By how much more is missed against the usual way; the interval is over drives."""
+    """By how much more is missed against the usual direction; the interval is over drives."""
     draws = [Resamples.of(len(one), seed=at).counts for at, one in enumerate((usual, against))]
     values = draws[1] @ against / len(against) - draws[0] @ usual / len(usual)
     low, high = np.percentile(values, [5, 95])

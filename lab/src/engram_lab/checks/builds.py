@@ -1,4 +1,4 @@
-"""What a build of a fleet's map costs, beside another version, in runs that alternate.
+"""What a build of a fleet's map costs, against another version, in alternating runs.
 
     python -m engram_lab.checks.builds --against CHECKOUT --drives 16 FOLDER…
 

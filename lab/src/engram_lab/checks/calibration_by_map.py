@@ -72,7 +72,7 @@ def frames_by(street: Street, camera: StereoCamera, settings: Settings) -> Itera
 
 
 def judged(street: Street, weather: str, fault: str, by: float, settings: Settings) -> Judged:
-    """Drives once, told its place."""
+    """Drives once, from a given position."""
     camera = miscalibrated(street.frames[0].frame.camera, fault, by)
     localiser = localiser_in(street.opened, camera, settings, live=street.live.session.id)
     front, fixes, false = Front(settings), 0, 0

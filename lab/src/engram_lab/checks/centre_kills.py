@@ -58,7 +58,7 @@ _HASTY = AgentSettings(first_retry_s=0.05, longest_retry_s=0.2, idle_s=0.1)
 
 @dataclass
 class Day:
-    """What became of one day.
+    """Result of one day.
 
     Attributes:
         kills: victims, in their order.
@@ -75,7 +75,7 @@ class Day:
 
 
 def live(folder: Path, name: str) -> None:
-    """Main function of a robot: it goes on from whatever its folder holds."""
+    """Main function of a robot: it continues from whatever its folder holds."""
     end_with_parent()
     with Agent(folder / name, _HASTY, wait=time.sleep) as agent:
         while True:
@@ -165,7 +165,7 @@ class Fleet:
         return sum(row["ended_ns"] is not None for row in rows)
 
     def end_day(self) -> None:
-        """Until every robot has handed in all that it drove; nobody dies any more."""
+        """Until every robot has handed in all that it drove, without further kills."""
         (self._folder / "over").touch()
         end_s = time.monotonic() + _LONGEST_S
         for name in _ROBOTS:

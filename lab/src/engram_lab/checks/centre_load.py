@@ -123,7 +123,7 @@ class Day:
         }
 
     def _waited(self, seconds: float) -> bool:
-        """Whether the day goes on after some seconds."""
+        """Whether the day continues after some seconds."""
         left_s = self._end_s - time.monotonic()
         self._over.wait(min(seconds, max(left_s, 0.0)))
         return time.monotonic() < self._end_s

@@ -79,7 +79,7 @@ class Start:
 
     @property
     def wrong(self) -> bool:
-        """Whether a wrong place was believed."""
+        """Whether a wrong place was accepted."""
         return self.status == "found" and not self.error_m <= WRONG_M
 
 
@@ -91,7 +91,7 @@ class LiveDrive:
     ) -> None:
         truth = drive.truth()
         if truth is None:
-            raise SystemExit(f"{drive.path} has no truth beside it")
+            raise SystemExit(f"{drive.path} has no truth next to it")
         self.drive, self.opened, self.settings = drive, opened, settings
         self.frames = drive.frames()
         self.truth = [truth.at(one.frame.stamp_ns) for one in self.frames]

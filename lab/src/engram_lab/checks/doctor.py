@@ -227,7 +227,7 @@ KINDS: dict[str, Kind] = {
 
 
 def windows() -> Iterator[Window]:
-    """The rendered clips, made first where the cache lacks them, and windows of the real ones."""
+    """The rendered clips, made first if not in the cache, and windows of the real ones."""
     for plan in DOCTORED:
         clip = plan.read()
         yield Window(plan.name, plan.rig, clip.pairs, clip.world_from_cam)
@@ -290,7 +290,7 @@ def _alarms(found: Diagnosis) -> list[str]:
 
 
 def run(file: Path) -> None:
-    """Makes the trials that the file lacks, window by window."""
+    """Makes the trials that are missing from the file, window by window."""
     done = {(one["window"], one["kind"]) for one in _kept(file)}
     file.parent.mkdir(parents=True, exist_ok=True)
     for window in windows():

@@ -1,4 +1,4 @@
-"""Streets of equal fronts: robots on a street that is not mapped, beside one that is.
+"""Streets of equal fronts: robots on an unmapped street next to a mapped one.
 
     python -m engram_lab.checks.equal_fronts                     # 20, 30 and 37.5 m, three towns
     python -m engram_lab.checks.equal_fronts --first-town 601    # the same fronts in other towns
@@ -113,7 +113,7 @@ class Estate:
         return Street(path, [self.mapped], self._drive(number), self._settings, 8)
 
     def _built(self, numbers: Sequence[int]) -> Path:
-        """A map of some drives, made anew by each run: it hangs on the settings."""
+        """A map of some drives, made again by each run: it depends on the settings."""
         if tuple(numbers) in self._maps:
             return self._maps[tuple(numbers)]
         path = self._folder / f"equal{''.join(map(str, numbers))}.engram"
@@ -170,7 +170,9 @@ def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--periods", default=",".join(map(str, PERIODS_M)), help="metres")
     parser.add_argument("--first-town", type=int, default=_FIRST_TOWN, help="its seed")
-    parser.add_argument("--beside", type=numbers, default=BESIDE, help="drives beside: 2, 3, 5, 6")
+    parser.add_argument(
+        "--beside", type=numbers, default=BESIDE, help="drives on the unmapped street: 2, 3, 5, 6"
+    )
     parser.add_argument("--equal", type=float, default=1.0, help="share of equal fronts")
     parser.add_argument("--unique", default=",".join(Unique), help="what is unique")
     parser.add_argument("--starts", type=int, default=2, help="of each kind on each drive")

@@ -113,7 +113,7 @@ def _along_kitti(frontend: Frontend, data: Path) -> Iterator[tuple[str, list[Pai
 def odometry(
     frontend: Frontend, matching: Matching, data: Path
 ) -> Iterator[tuple[str, float, float, int]]:
-    """How far odometry drifts, in per cent of the way."""
+    """How far odometry drifts, in per cent of the distance."""
     del matching
     folder, engine = data / "kitti_odometry", Odometry(OdometryConfig())
     truth = [SE3.from_matrix(row.reshape(3, 4)) for row in np.loadtxt(folder / "poses/06.txt")]

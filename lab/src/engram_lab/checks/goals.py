@@ -53,7 +53,7 @@ Truths: TypeAlias = dict[SessionId, Truth | None]
 
 @dataclass(slots=True)
 class Progress:
-    """What is done; kept beside the map.
+    """What is done; kept next to the map.
 
     Attributes:
         merged: drives merged.
@@ -105,7 +105,7 @@ def truths_of(driven: list[Round]) -> Truths:
 
 
 def plant_goals(path: Path, count: int, rng: np.random.Generator) -> dict[str, FramePose]:
-    """Stores goals beside nodes drawn at random; returns where they lie in the frame."""
+    """Stores goals near nodes drawn at random; returns where they lie in the frame."""
     with Map.open(path, writes=True) as store:
         frame, graph = store.frame, store.graph
         goals: list[Goal] = []
@@ -202,7 +202,7 @@ def main() -> int:
     parser = command_line(__doc__)
     parser.add_argument("campaign")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, required=True, help="the map; goes on if it is there")
+    parser.add_argument("--out", type=Path, required=True, help="the map; continued if it exists")
     parser.add_argument("--goals", type=int, default=40)
     parser.add_argument("--drives", type=int, help="as many as the campaign has, if not given")
     parser.add_argument("--campaigns", type=Path, default=campaigns_folder())

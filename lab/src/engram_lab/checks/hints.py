@@ -1,4 +1,4 @@
-"""Robots that are told a wrong place of their own town, or carried there unseen.
+"""Robots that are given a wrong place of their own town, or carried there unseen.
 
     python -m engram_lab.checks.hints                         # held-out towns, 3,000 tries
     python -m engram_lab.checks.hints --tries 300 --json hints.json
@@ -31,7 +31,7 @@ KINDS = {"told": Kind.TOLD, "carried": Kind.CARRIED, "gap": Kind.GAP, "lost": Ki
 
 @dataclass(frozen=True, slots=True)
 class Came:
-    """What came of one try.
+    """Result of one try.
 
     Attributes:
         street: the map and the drive.
@@ -54,7 +54,7 @@ class Came:
 
     @property
     def key(self) -> tuple[str, str, int, float, int]:
-        """What tells it apart."""
+        """What identifies it."""
         return self.street, self.kind, self.first, self.sigma_m, self.seed
 
 

@@ -86,7 +86,7 @@ class Harness:
         gc.freeze()  # children neither walk nor copy what the parent made
 
     def trial(self, number: int, seed: int) -> tuple[str, Trial]:
-        """One case: the kind of the change, and what became of it."""
+        """One case: the kind of the change, and its result."""
         kind = list(self._changes)[number % len(self._changes)]
         with tempfile.TemporaryDirectory(dir=self._folder) as folder:
             chance = random.Random(f"{seed} {number}")

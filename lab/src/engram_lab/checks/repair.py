@@ -67,7 +67,7 @@ class Town:
     dropped: set[int] = field(default_factory=set)
 
     def error_m(self, edge: Edge) -> float:
-        """How far an edge lies from the truth; NaN where that is not known."""
+        """How far an edge lies from the truth; NaN where that is unknown."""
         a, b = self.true.pose(edge.a), self.true.pose(edge.b)
         if a is None or b is None:
             return float("nan")

@@ -1,4 +1,4 @@
-"""The ROS 2 bridge under faults, or beside busy loops, with a real ROS 2 from wheels.
+"""The ROS 2 bridge under faults, or next to busy loops, with a real ROS 2 from wheels.
 
     python -m engram_lab.checks.ros_bridge faults --ros .venv-ros/bin/python [--times 50] [--lost]
     python -m engram_lab.checks.ros_bridge endure --ros .venv-ros/bin/python [--minutes 10]
@@ -64,7 +64,7 @@ class There:
         self.pairs = list(self.drive)
 
     def mapped(self) -> MemorySequence:
-        """The way there."""
+        """The outward leg."""
         return MemorySequence(self.pairs[: len(self.pairs) // 2 + 1])
 
 
@@ -114,7 +114,7 @@ def main() -> int:
 
 
 def _prepared(folder: Path) -> Path:
-    """Writes the pairs of a lap, where they lie in the map frame, and a map of the way there."""
+    """Writes the pairs of a lap, where they lie in the map frame, and a map of the outward leg."""
     there = There(_LAP_S, _WAY_M)
     town = folder / "town.engram"
     map_drive(town, there.mapped())

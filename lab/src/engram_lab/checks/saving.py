@@ -97,7 +97,7 @@ def by_a_fleet(
 
 
 def driven(town: int, settings: Settings, folder: Path) -> Iterator[Driven]:
-    """All drives of a town but the first, by each way of mapping."""
+    """All drives of a town but the first, by each method of mapping."""
     drives, plans = drives_in(town, settings), trial_town(town).sessions
     truths = [truth for one in drives if (truth := one.truth()) is not None]
     for by, rule in product(_LIMITS, ("as published", "default")):
@@ -116,7 +116,7 @@ def driven(town: int, settings: Settings, folder: Path) -> Iterator[Driven]:
 
 
 def figures(rows: Sequence[Driven]) -> Iterator[Figure]:
-    """Of each way of mapping: right and false fixes in each weather, nodes in the end."""
+    """Of each method of mapping: right and false fixes in each weather, nodes in the end."""
     for by, rule in dict.fromkeys((row.by, row.rule) for row in rows):
         some = [row for row in rows if (row.by, row.rule) == (by, rule)]
         nodes = {row.town: row.nodes for row in some}  # after the last drive

@@ -92,7 +92,7 @@ def localising(frames: int) -> Iterator[Figure]:
 def aged(
     robot: Callable[[], Robot], frame_at: Callable[[int], StereoPair | LoggedFrame], frames: int
 ) -> Iterator[Figure]:
-    """What a robot's memory grew by in so many frames, and its blocks beside a fresh one's."""
+    """What a robot's memory grew by in so many frames, and its blocks against a fresh one's."""
     settled = min(1000, frames)
     with robot() as old:
         drive(old, frame_at, range(settled))

@@ -31,7 +31,7 @@ MAPS = {"whole": None, "every other frame": "0::2", "first half": "0:25"}
 
 @dataclass
 class Tally:
-    """What came of drives with a fault.
+    """Results of drives with a fault.
 
     Attributes:
         tries: how many there were.

@@ -1,4 +1,4 @@
-"""False fixes of robots that nothing disturbs, by the way they drive: events per 100 km.
+"""False fixes of undisturbed robots, by how they drive: events per 100 km.
 
     python -m engram_lab.checks.undisturbed keble                       # 8 maps of 3 drives each
     python -m engram_lab.checks.undisturbed keble,oxford --maps 20 --drives 2 --json events.json
@@ -46,7 +46,7 @@ _LEVEL = 0.95
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """What came of one robot that drove to the end of a drive.
+    """Result of one robot that drove to the end of a drive.
 
     Attributes:
         metres: it drove.
@@ -87,7 +87,7 @@ class Driven:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What tells it apart."""
+        """What identifies it."""
         how = self.start, self.kind, self.method, self.sure
         return self.campaign, self.mapped, self.drive, *how
 
@@ -104,7 +104,7 @@ def events_of(at_m: Sequence[float]) -> int:
 
 
 def driven(street: Street, kind: Kind, first: int) -> Way:
-    """What comes of a robot that starts at a frame."""
+    """Result of a robot that starts at a frame."""
     way = np.array([pose.translation for pose in street.truth])
     along_m = np.concatenate([[0.0], np.linalg.norm(np.diff(way, axis=0), axis=1).cumsum()])
     frames = fixes = off = 0
@@ -141,7 +141,7 @@ class Kept:
         self._rows = {row.key: row for row in map(Driven.of, lines)}
 
     def get(self, key: tuple[object, ...]) -> Driven | None:
-        """What is known already."""
+        """The stored row of a key."""
         return self._rows.get(key)
 
     def add(self, row: Driven) -> None:
@@ -152,7 +152,7 @@ class Kept:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """How much is asked for of each campaign.
+    """How much is requested of each campaign.
 
     Attributes:
         maps: how many maps are drawn; one that is drawn twice counts once.

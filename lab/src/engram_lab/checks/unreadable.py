@@ -138,7 +138,7 @@ def _odd_bags(folder: Path, given: list[str]) -> Iterator[tuple[str, list[str]]]
 
 
 def _odd_files(folder: Path) -> Iterator[tuple[str, Path]]:
-    """Files that are none of what their names say."""
+    """Files that are not what their names say."""
     doubling = ["a0: &a0 [0, 0, 0, 0, 0, 0, 0, 0, 0]"]
     doubling += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 30)]
     (folder / "bomb.yaml").write_text("\n".join(doubling))

@@ -47,7 +47,7 @@ def of_log(path: Path, window: WindowConfig, name: str) -> Iterator[Figure]:
     """Drift and excess length of a simulated lap."""
     known = read_truth(path)
     if known is None:
-        raise SystemExit(f"{path}: has no truth beside it; give logs of engram lab simulate")
+        raise SystemExit(f"{path}: has no truth next to it; give logs of engram lab simulate")
     log = FrameLog(path)
     poses, truth = poses_by([one.frame for one in log], window), list(known.world_from_cam)
     log.close()

@@ -1,4 +1,4 @@
-"""Attempts of lost robots at places where they are not: how many would be believed.
+"""Attempts of lost robots at places where they are not: how many would be accepted.
 
     python -m engram_lab.checks.wrong_places                      # 10^6 attempts, held-out towns
     python -m engram_lab.checks.wrong_places --towns 401,402,403,404 --every 1 --json wrong.json

@@ -117,7 +117,7 @@ class _Study:
 
 
 def _studying(verb: Callable[..., None]) -> Callable[..., None]:
-    """Gives a verb the options of `_Study` beside its own, and hands them to it as `study`."""
+    """Gives a verb the options of `_Study` in addition to its own, as the argument `study`."""
     hints = get_type_hints(_Study, include_extras=True)
     defaults = {one.name: one.default for one in fields(_Study) if one.name != "drives"}
     shared = [

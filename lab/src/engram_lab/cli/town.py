@@ -109,7 +109,8 @@ def simulate(
         int, typer.Option("--workers", metavar="N", min=1, help="Processes on this machine.")
     ] = 2,
     period: Annotated[
-        float, typer.Option("--period", metavar="M", help="estate: way after which fronts repeat.")
+        float,
+        typer.Option("--period", metavar="M", help="estate: distance after which fronts repeat."),
     ] = 37.5,
     equal: Annotated[
         float, typer.Option("--equal", metavar="SHARE", help="estate: share of equal fronts.")
@@ -171,7 +172,7 @@ def bench(
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Time each stage beside plain OpenCV.
+    """Time each stage against plain OpenCV.
 
     Everything runs on one core, in memory, each stage interleaved with its reference. With
     --against, another checkout is the reference: both run in alternating blocks, in two processes.

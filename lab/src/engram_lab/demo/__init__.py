@@ -1,4 +1,4 @@
-"""The story that `engram demo` tells."""
+"""The story of `engram demo`."""
 
 from engram_lab.demo.story import DemoReport, run_demo
 

@@ -63,7 +63,7 @@ PARTS = {"monday": SamplePart(0, 0, 40), "tuesday": SamplePart(2, 10, 50)}
 
 
 def write_facts(part: SamplePart, folder: Path) -> None:
-    """Writes all but the images: calibration and stamps, and the truth beside the folder."""
+    """Writes all but the images: calibration and stamps, and the truth next to the folder."""
     drive, frames = part.drive(), range(part.first, part.last)
     about = (
         f"A simulated drive, rendered by engram-lab: {drive.plan.name} of the campaign "

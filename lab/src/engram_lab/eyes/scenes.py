@@ -84,7 +84,7 @@ class Scene:
 
 
 def drawn_visits(seed: int) -> dict[str, Visit]:
-    """Hours and dates drawn anew for each town, so that none is one that is judged."""
+    """Hours and dates drawn again for each town, so that none is one that is judged."""
     draws, visits, day = np.random.default_rng(seed), {}, 300
     for count, months, hours, weathers in _DRAWN:
         for _ in range(count):

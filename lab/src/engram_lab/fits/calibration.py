@@ -107,7 +107,7 @@ def inliers_of(node_frames: Frames, live_frames: Frames) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Appearance:
-    """How the morning's map serves the other visits of a town.
+    """How well the morning's map localises the other visits of a town.
 
     Attributes:
         corners: (P,) corners of the morning's frames.

@@ -89,7 +89,7 @@ _WITNESS_M = (4.0, 15.0)
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One match: what was known, and how far off its pose was."""
+    """One match: its evidence, and how far off its pose was."""
 
     evidence: Evidence
     error_m: float
@@ -347,7 +347,7 @@ def judged(model: ConfidenceModel, rows: Sequence[Row], fit: Sequence[Row]) -> I
 
 
 def passing(model: ConfidenceModel, rows: Rows) -> Iterator[Figure]:
-    """Matches that robots near a confirmed or a told position would believe, of those that count.
+    """Matches that robots near a confirmed or a given position would accept, of those that count.
 
     Matches count that have the least inliers and determine the position.
     """
@@ -374,7 +374,7 @@ def passing(model: ConfidenceModel, rows: Rows) -> Iterator[Figure]:
 
 
 def estate_rows(towns: Sequence[int], settings: Settings, monitor: Monitor) -> list[Row]:
-    """Matches of robots that are switched on beside a mapped ring of equal fronts: all are wrong.
+    """Matches of robots that are switched on next to a mapped ring of equal fronts: all are wrong.
 
     Args:
         towns: seeds of the estates, which are rendered if they are not there.

@@ -34,7 +34,7 @@ def widest(covariance: NDArray[np.float64]) -> float:
 
 
 def at_end(covariance: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) of the end point of a way, from the (6, 6) left perturbation of its pose."""
+    """(3, 3) of the end point of a path, from the (6, 6) left perturbation of its pose."""
     x, y, z = end
     lever = np.hstack([np.eye(3), -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])])
     moved: NDArray[np.float64] = lever @ covariance @ lever.T
@@ -42,7 +42,7 @@ def at_end(covariance: NDArray[np.float64], end: NDArray[np.float64]) -> NDArray
 
 
 def ways(drive: EvaluatedDrive, length: int) -> Iterator[tuple[float, float, float, float]]:
-    """Error and standard deviation of each way: metres, metres, radians, radians."""
+    """Error and standard deviation of each path: metres, metres, radians, radians."""
     truth = drive.truth()
     if truth is None:
         return

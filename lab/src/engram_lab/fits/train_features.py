@@ -134,7 +134,7 @@ def sources(monitor: Monitor) -> tuple[list[Source], list[Source]]:
 def train(
     out: Path, seed: int, steps: int, given: tuple[list[Source], list[Source]], monitor: Monitor
 ) -> PatchNetwork:
-    """Trains on rendered and real sources, or goes on training, and returns the network."""
+    """Trains on rendered and real sources, or continues training, and returns the network."""
     out.mkdir(parents=True, exist_ok=True)
     drawer = Drawer(*given, _REAL_SHARE, np.random.default_rng(seed))
     training, file = Training(drawer, steps, seed), out / f"{seed}.pt"

@@ -132,7 +132,7 @@ class MonthResult:
 def measure_laps(
     laps: Sequence[Path], work: Path, workers: int = 1, monitor: Monitor = QUIET
 ) -> MonthResult:
-    """Five folds over some laps, everything attempted; goes on where an earlier run stopped.
+    """Five folds over some laps, everything attempted; continues where an earlier run stopped.
 
     Args:
         laps: their frame logs, with truth.

@@ -203,6 +203,6 @@ def _length_m(log: Path) -> float:
     """How far the town's robot drove."""
     truth = read_truth(log)
     if truth is None:
-        raise EngramError(f"{log}: the true path beside it is gone; remove the log as well")
+        raise EngramError(f"{log}: the true path next to it is gone; remove the log as well")
     positions = np.array([pose.translation for pose in truth.world_from_cam])
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())

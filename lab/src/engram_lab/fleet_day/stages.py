@@ -1,4 +1,4 @@
-"""Stages of a day, told while they run, and timed."""
+"""Stages of a day, reported while they run, and timed."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ Tell: TypeAlias = Callable[[str], None]
 
 
 class Outcome(StrEnum):
-    """What became of a case."""
+    """Result of a case."""
 
     REFUSED = "refused"
     READ = "read"
@@ -119,7 +119,7 @@ def tried(work: Work, folder: Path, limits: Limits | None = None) -> Trial:
 
 
 def _heard(read: int, child: int) -> tuple[list[dict[str, Any]], bool]:
-    """What the child told, a line each, and whether it had to be ended."""
+    """What the child reported, a line each, and whether it had to be ended."""
     told, end_s = b"", time.monotonic() + _STUCK_S
     with os.fdopen(read, "rb", buffering=0) as pipe:
         while True:

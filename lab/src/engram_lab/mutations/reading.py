@@ -211,7 +211,7 @@ def _hand_in(case: Case, folder: Path, merges: bool) -> bool:
 
 
 def _admit(manifest: Manifest, parts: dict[Any, bytes], path: Path) -> None:
-    """As the centre does; a stranger knows how to name the content of what it made."""
+    """As the centre does; a stranger can name the content of what it made."""
     try:
         write_checked(manifest, parts, path)
     except EngramError as error:

@@ -1,4 +1,4 @@
-"""Changes of rows: as damage leaves them, or sealed anew, as a stranger would."""
+"""Changes of rows: as damage leaves them, or sealed again, as a stranger would."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sound files to change: a map with rows in every table, its log beside it, drives, a hand-in."""
+"""Sound files to change: a map with rows in every table, its log, drives, a hand-in."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def _make_map(path: Path) -> None:
 
 
 def _make_logged(town: Path, path: Path) -> None:
-    """A copy of the map with one more revision and tag, of which only the log knows."""
+    """A copy of the map with one more revision and tag, which only the log contains."""
     draft = path.with_name("draft.engram")
     copy_map(town, draft)
     with Map.open(draft, writes=True) as store:

@@ -169,7 +169,7 @@ def _lines(text: str, chance: random.Random) -> str:
 
 
 def _aliases(text: str, chance: random.Random) -> str:
-    """A short text that aliases make long, in the place of a value or beside all."""
+    """A short text that aliases make long, in the place of a value or in addition to all."""
     depth, width = chance.choice([(1, 1), (3, 3), (9, 9), (30, 2), (2, 3_000)])
     bomb = [f"a0: &a0 [{', '.join(['x'] * width)}]"]
     bomb += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * width)}]" for n in range(1, depth + 1)]

@@ -66,7 +66,7 @@ class Site:
                 HandIns(self.centre).cancel(row, "lab")
 
     def states(self) -> Counter[str]:
-        """What became of the hand-ins."""
+        """Results of the hand-ins."""
         rows = HandIns(self.centre).listed(_MAP, None, None, 2**62, 100_000)
         return Counter(row["state"] for row in rows)
 

@@ -56,7 +56,7 @@ class CollaborativePolicy:
 def _reached(
     context: RankingContext, sessions: NDArray[np.int32], nodes: NDArray[np.int32]
 ) -> NDArray[np.float64]:
-    """(S, N) 1 where the session saved the node or matched it on its way, else 0."""
+    """(S, N) 1 where the session saved the node or matched it, else 0."""
     graph = context.graph
     paths = [path_id(graph.session(number)) for number in sessions]
     saved = graph.sessions_of(nodes) == sessions[:, None]

@@ -1,4 +1,4 @@
-"""How much each attempt of this run tells."""
+"""How informative each attempt of this run is."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def decay(run: RunAttempts, length_m: float) -> NDArray[np.float64]:
 
 
 def failure_weights(run: RunAttempts) -> NDArray[np.float64]:
-    """(R,) how much each failure tells against its experience: g, and 0 for successes.
+    """(R,) how much each failure counts against its experience: g, and 0 for successes.
 
-    A failure far from the node was to be expected; one without a prediction tells nothing.
+    A failure far from the node was to be expected; one without a prediction counts nothing.
     """
     return np.where(run.accepted | np.isnan(run.rates), 0.0, run.rates)

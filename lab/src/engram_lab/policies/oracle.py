@@ -1,4 +1,4 @@
-"""Γ(oracle): knows what will match. The bound that any policy can reach."""
+"""Γ(oracle): is given what will match. The bound that any policy can reach."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class OraclePolicy:
         """
         if context.foresee is None:
             raise ConfigError(
-                "the policy oracle must be told what would match, and this context cannot tell; "
+                "the policy oracle needs the matches in advance, and this context has none; "
                 "use it in engram lab evaluate, and another policy for a drive"
             )
         known = context.foresee()

@@ -1,4 +1,4 @@
-"""Γ(random): the policy that knows nothing, to measure others against."""
+"""Γ(random): the policy without information, to measure others against."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ def build_map(
     known: Sequence[EvaluatedDrive] = (),
     look_at: Callable[[EvaluatedDrive, MapReport], None] | None = None,
 ) -> BuiltMap:
-    """Maps the drives one after another; goes on where an earlier run stopped.
+    """Maps the drives one after another; continues where an earlier run stopped.
 
     A session is mapped in a copy that takes the map's place when it is whole, so that a map that
     was built with interruptions is the same as one that was not.
@@ -160,7 +160,7 @@ def read_built_map(path: Path) -> BuiltMap:
 
 
 def read_record(path: Path) -> BuiltMap:
-    """What the record beside a map says, without a look at the map.
+    """The record stored with a map, read without the map.
 
     Raises:
         InputError: it is damaged.
@@ -174,7 +174,7 @@ def read_record(path: Path) -> BuiltMap:
         return BuiltMap(path, sessions, dict(known.get("in_force", {})))
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise InputError(
-            f"{record} does not tell how far {path.name} is ({error}); remove both, and the same "
+            f"{record} does not show how far {path.name} is ({error}); remove both, and the same "
             "command builds the map again"
         ) from error
 
@@ -188,13 +188,13 @@ def newest_in_force(path: Path) -> Values:
 def _begin(
     built: BuiltMap, begun: Beginning, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]
 ) -> None:
-    """Notes what the robot runs by, and tells it its place."""
+    """Records the robot's resolved settings, and sets its position."""
     built.in_force = of_robot(begun.robot)
     _place(begun, drive, drives)
 
 
 def _place(begun: Beginning, drive: EvaluatedDrive, drives: Sequence[EvaluatedDrive]) -> None:
-    """Tells the robot where its drive begins, by truth, where that and a node there are known."""
+    """Sets the robot's position at the start, by truth, where that and a node there are known."""
     truth = drive.truth()
     if truth is None or begun.resumed:
         return

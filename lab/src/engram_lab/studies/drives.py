@@ -120,7 +120,7 @@ class DriveSet:
 
     @property
     def has_truth(self) -> bool:
-        """Whether all drives have their truth beside them."""
+        """Whether all drives have their truth next to them."""
         return all(drive.has_truth for drive in self.drives)
 
     @property

@@ -50,7 +50,7 @@ def chosen(folds: tuple[Fold, ...], only: tuple[int, ...]) -> tuple[Fold, ...]:
 
 
 def check_only(only: tuple[int, ...], folds: int) -> None:
-    """Whether some folds that are asked for exist.
+    """Whether some requested folds exist.
 
     Raises:
         ConfigError: one does not.
@@ -58,5 +58,5 @@ def check_only(only: tuple[int, ...], folds: int) -> None:
     strange = [one for one in only if not 0 <= one < folds]
     if strange:
         raise ConfigError(
-            f"folds {strange} are asked for; {folds} folds are numbered from 0 to {folds - 1}"
+            f"folds {strange} are requested; {folds} folds are numbered from 0 to {folds - 1}"
         )

@@ -127,7 +127,7 @@ def columns(known: Mapping[str, Any]) -> Values:
 
 
 def rows(known: Mapping[str, Any], settings: AllSettings, about: Mapping[str, Any]) -> list[Values]:
-    """A row per setting and version in force, beside what the settings say.
+    """A row per setting and version in force, next to what the settings say.
 
     Args:
         known: what is in force.

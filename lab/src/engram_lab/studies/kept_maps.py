@@ -10,7 +10,7 @@ from engram.maps.frame_reader import DEFAULT_CACHE_BYTES
 
 
 class KeptMaps:
-    """The map files asked for last, as they were when they were opened; one worker's.
+    """The map files requested last, as they were when they were opened; one worker's.
 
     Args:
         files: how many are kept, each in all the revisions that were asked for.
@@ -23,7 +23,7 @@ class KeptMaps:
         self._files: OrderedDict[tuple[Path, int], dict[int | None, Map]] = OrderedDict()
 
     def open(self, path: Path, at: int | None = None) -> Map:
-        """A map, of a revision if one is given. It is closed here, once others were asked for.
+        """A map, of a revision if one is given. It is closed here, once others are requested.
 
         Raises:
             MapError: it cannot be read.

@@ -284,7 +284,7 @@ def _robots(
     settings: Settings,
     parts: LocaliserParts,
 ) -> Iterator[list[_Running]]:
-    """One per configuration; in one map they share what is known of it."""
+    """One per configuration; in one map they share its matches."""
     with ExitStack() as stack:
         keeper, running = _Placing(situation), list[_Running]()
         for one in configurations:

@@ -1,4 +1,4 @@
-"""Matches of one live session that were made once and serve every policy (method §8).
+"""Matches of one live session that were made once and are used by every policy (method §8).
 
 `match(live, node)` is a pure function of two frames and the matcher's configuration, so that its
 results may be kept: unguided, by (live UUID, node UUID, matcher hash). Whether a match is accepted
@@ -32,7 +32,7 @@ _NO_MATCH = Match(None, None, 0, _NO_ROWS, _NO_ROWS)
 
 
 class MatchMemo:
-    """A `Matcher` that asks another one only for what it does not know.
+    """A `Matcher` that asks another one only for what it does not contain.
 
     What it gives back has no rows of landmarks: nobody behind the matcher looks at them.
 
@@ -62,7 +62,7 @@ class MatchMemo:
 
     @property
     def known(self) -> int:
-        """Pairs of frame and node whose match is known, found or not."""
+        """Pairs of frame and node whose result is stored, found or not."""
         return sum(len(matches) for matches in self._frames.values())
 
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
@@ -90,7 +90,7 @@ class MatchMemo:
         return self._spreads[key]
 
     def prefetch(self, nodes: list[NodeId]) -> None:
-        """See `Matcher`; most of them are known."""
+        """See `Matcher`; most of them are stored."""
 
     def _make(self, live: Frame, live_id: NodeId, node: NodeId) -> Match:
         started = thread_time()
@@ -102,7 +102,7 @@ class MatchMemo:
         return Match(match.reference_from_live, match.covariance, match.inliers, _NO_ROWS, _NO_ROWS)
 
     def save(self) -> None:
-        """Writes what is known, in one step: a killed run leaves the file as it was."""
+        """Writes all results, in one step: a killed run leaves the file as it was."""
         nodes = sorted({node for known in self._frames.values() for node in known})
         number = {node: k for k, node in enumerate(nodes)}
         rows = [

@@ -30,7 +30,7 @@ _STUDY_VERSION = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudyOptions:
-    """What every study is asked.
+    """Options of every study.
 
     Attributes:
         folds: of the cross-validation.
@@ -58,7 +58,7 @@ Options = TypeVar("Options", bound=StudyOptions)
 
 @dataclass(frozen=True, slots=True)
 class StudyPlan(Generic[Options]):
-    """All that a worker needs to know.
+    """All that a worker needs.
 
     Attributes:
         drives: what is evaluated.

@@ -90,7 +90,7 @@ class RankingOptions(StudyOptions):
 
 @dataclass(frozen=True, slots=True)
 class Plan(StudyPlan[RankingOptions]):
-    """All that a worker needs to know."""
+    """All that a worker needs."""
 
     def map_path(self, fold: Fold) -> Path:
         """The map built from a fold's training sessions."""

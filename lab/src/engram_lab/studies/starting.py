@@ -50,13 +50,13 @@ class TrueNodes:
         return self._poses.get(node)
 
     def near(self, world_from_live: SE3, radius_m: float) -> set[NodeId]:
-        """The nodes that are truly within a radius and look the same way (method §3.1)."""
+        """The nodes that are truly within a radius and look in the same direction (method §3.1)."""
         apart_m = np.linalg.norm(self._positions - world_from_live.translation, axis=1)
         alike = self._headings @ world_from_live.rotation[:, 2] >= np.cos(_VIEW_GATE_RAD)
         return {self._ids[k] for k in np.flatnonzero((apart_m <= radius_m) & alike)}
 
     def start(self, world_from_live: SE3) -> Position | None:
-        """The position seen from the nearest node that looks the same way; None without nodes.
+        """The position seen from the nearest node with the same heading; None without nodes.
 
         Rather of those that hang together: what a drive saved where its odometry had lost track,
         in heavy rain, may be joined to nothing, and a robot set down there would find no other
@@ -74,7 +74,7 @@ class TrueNodes:
 
 
 def _in_largest_component(graph: ExperienceGraph, nodes: Sequence[NodeId]) -> NDArray[np.bool_]:
-    """(N,) whether each node is in the part of the graph that hangs together and is largest."""
+    """(N,) whether each node is in the graph's largest connected component."""
     labels = graph.components()
     largest = np.argmax(np.bincount(labels)) if len(labels) else -1
     rows = np.array([graph.index(node) for node in nodes], np.int64)

@@ -228,7 +228,7 @@ class CampaignResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lap:
-    """One session along its way.
+    """One session along its route.
 
     Attributes:
         name: of the session.
@@ -327,7 +327,7 @@ def _nodes(built: BuiltMap, fold: Fold, one: Configuration) -> int:
     count = len(fold.training) if one.sessions is None else one.sessions
     if count > len(built.sessions):
         raise InputError(
-            f"{built.path.with_suffix('.json')} tells of {len(built.sessions)} sessions, and there "
+            f"{built.path.with_suffix('.json')} has {len(built.sessions)} sessions, and there "
             f"are results in a map of {count}; give the command again without --report-only"
         )
     return built.sessions[count - 1].nodes

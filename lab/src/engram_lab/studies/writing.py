@@ -1,4 +1,4 @@
-"""Results are written by one run at a time; where they cannot be, that is said like any error."""
+"""Results are written by one run at a time; failures are reported like any error."""
 
 from __future__ import annotations
 

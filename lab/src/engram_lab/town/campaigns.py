@@ -120,7 +120,7 @@ class Campaign:
         return CAMPAIGNS[self.home](self.seed, self.size).first_day
 
     def plan(self) -> tuple[StreetPlan, Route]:
-        """Where its streets run and the way that is driven."""
+        """Where its streets run and the route that is driven."""
         if self.fronts is not None:
             return equal_rings(self.fronts, self.seed)
         return (crossing_loops if self.crossing else loop_of_length)(self.length_m, self.seed)
@@ -237,7 +237,7 @@ def _village(seed: int, size: Size) -> Campaign:
 
 
 def _begbroke(seed: int, size: Size) -> Campaign:
-    """107 laps in two months, 7 h to 19 h local; at standard size begbroke24h's by day."""
+    """107 laps in two months, 7 h to 19 h local; at standard size begbroke24h's daytime laps."""
     if size is Size.STANDARD:
         whole = _begbroke24h(seed, size)
         laps = tuple(lap for lap in whole.sessions if by_day(lap.start))
@@ -251,7 +251,7 @@ def _begbroke(seed: int, size: Size) -> Campaign:
 
 
 def _begbroke24h(seed: int, size: Size) -> Campaign:
-    """Regular starts day and night, 6 August to 5 September; as much rain by night as by day."""
+    """Regular starts day and night, 6 August to 5 September; as much rain at night as by day."""
     count = 140 if size is Size.FULL else 80
     rng = np.random.default_rng([seed, 0x24])
     first = datetime(2025, 8, 6, tzinfo=UTC)
@@ -291,7 +291,7 @@ MAPPED, AGAIN, BESIDE = 0, 1, [3, 2]
 
 
 def estate(seed: int, size: Size = Size.STANDARD, fronts: Fronts | None = None) -> Campaign:
-    """Rings between equal fronts, one of them mapped, the other one beside it.
+    """Rings between equal fronts, one of them mapped, the other one next to it.
 
     Args:
         seed: of the town.

@@ -160,7 +160,7 @@ class Conditions:
 
 
 def _drift(seed: int, driven_m: float) -> float:
-    """A slow function of the way, −1…1: three waves of 90 to 400 m with phases of the seed."""
+    """A slow function of distance, −1…1: three waves of 90 to 400 m with phases of the seed."""
     rng = np.random.default_rng([seed & 0x7FFFFFFF, 0xC10D])
     lengths_m = rng.uniform([90, 150, 260], [150, 260, 400])
     phases = rng.uniform(0, 2 * np.pi, 3)

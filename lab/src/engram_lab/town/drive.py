@@ -160,7 +160,7 @@ def drive(
 
 
 class _Waves:
-    """Sums of sines with random phases: the unsteadiness of a ride as functions of the way."""
+    """Sums of sines with random phases: the unsteadiness of a ride as functions of distance."""
 
     def __init__(self, style: DrivingStyle, shake: float) -> None:
         rng = np.random.default_rng([style.seed & 0x7FFFFFFF, 0xD817E])

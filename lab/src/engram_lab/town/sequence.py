@@ -36,7 +36,7 @@ class SimulatedSequence:
 
     @property
     def info(self) -> SequenceInfo:
-        """What is known of the drive as a whole; campaign and seed are part of the robot's name.
+        """Facts about the drive as a whole; campaign and seed are part of the robot's name.
 
         They stand for the robot's identity (method §2.7): wildcats of two towns are two robots.
         """

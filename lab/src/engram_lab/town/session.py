@@ -77,7 +77,7 @@ class SimulatedDrive:
         return self.frames()
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoPair]:
-        """Pairs `start` to `stop`; the exposure settles anew at the first."""
+        """Pairs `start` to `stop`; the exposure settles again at the first."""
         camera_model = CameraModel(self.robot, self.plan.seed, self.plan.lens)
         for k, pose in enumerate(self.poses[start:stop], start):
             moment = self.conditions.at(pose.driven_m, pose.elapsed_s)

@@ -170,7 +170,7 @@ def _is_done(task: _Task) -> bool:
 
 
 def _is_outdated(target: Path) -> bool:
-    """Whether a whole log is there, which a session that is rendered anew replaces."""
+    """Whether a whole log is there, which a session that is rendered again replaces."""
     if not target.exists():
         return False
     try:

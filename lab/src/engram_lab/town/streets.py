@@ -178,7 +178,7 @@ class Route:
     beside: Route | None = None
 
     def streets(self) -> Iterator[Street]:
-        """The streets it uses, in order, each with its smaller junction first; those beside."""
+        """The streets it uses, in order, each with its smaller junction first; then the next ring's."""
         for k, start in enumerate(self.junctions):
             end = self.junctions[(k + 1) % len(self.junctions)]
             yield (min(start, end), max(start, end))
@@ -186,7 +186,7 @@ class Route:
             yield from self.beside.streets()
 
     def all_junctions(self) -> tuple[Junction, ...]:
-        """Its own junctions, and those beside."""
+        """Its own junctions, and those of the ring next to it."""
         return self.junctions + (() if self.beside is None else self.beside.all_junctions())
 
 
@@ -205,7 +205,7 @@ def loop_of_length(length_m: float, seed: int) -> tuple[StreetPlan, Route]:
 
 
 def equal_rings(fronts: Fronts, seed: int) -> tuple[StreetPlan, Route]:
-    """A plan whose fronts repeat, a ring round two blocks, and another one beside it.
+    """A plan whose fronts repeat, a ring round two blocks, and another one next to it.
 
     The two share no street; one block lies between them.
     """

@@ -17,7 +17,7 @@ from engram.sequences.framelog.header import FrameLogHeader
 
 
 class Upkeep(Enum):
-    """What became of a log."""
+    """Result of checking a log."""
 
     KEPT = "kept"
     REWRITTEN = "rewritten"
@@ -50,7 +50,7 @@ def bring_up_to_date(path: Path, settings: Settings) -> Upkeep:
             raise IncompatibleError(
                 f"{path}: was rendered with another version or other settings of the front-end "
                 f"({log.header.frontend}, now {frontend}); give another --out, or remove the "
-                "folder to render anew"
+                "folder to render again"
             )
         looks_twice = settings.frontend.second_threshold > 0
         once = looks_twice and log.header.frontend in _looking_once(settings)

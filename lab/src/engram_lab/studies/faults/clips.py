@@ -227,7 +227,7 @@ def _render(plan: ClipPlan, path: Path) -> None:
 
 
 def _reversed_start(plan: ClipPlan, drive: SimulatedDrive) -> int:
-    """The frame of a drive the other way round that is nearest to where the stretch ends."""
+    """The frame of a drive in the opposite direction that is nearest to the end of the stretch."""
     forwards = drive_of(replace(plan, reverse=False)).world_from_cams()
     end = forwards[plan.start + plan.count - 1].translation
     return int(

@@ -244,7 +244,7 @@ class Blackout:
 
 @dataclass(frozen=True, slots=True)
 class Kidnapped:
-    """The robot is carried on along the route, unseen, and its stamps go on."""
+    """The robot is carried on along the route, unseen, and its stamps continue."""
 
     name: str = "kidnapped"
     unit: str = "frames"

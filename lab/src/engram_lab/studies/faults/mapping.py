@@ -50,7 +50,7 @@ def map_on(trial: Trial, scene: Scene, path: Path) -> None:
 
 
 def _told(scene: Scene, beginning: Beginning) -> None:
-    """Has the robot told a wrong place before the first frame of the fault."""
+    """Gives the robot a wrong place before the first frame of the fault."""
     if scene.hint is None:
         return
     hint, before_ns = scene.hint, scene.clip.pairs[scene.start - 1].stamp_ns

@@ -48,7 +48,7 @@ class Place:
     def wrong_hint(
         self, world_from_cam: SE3, sigma_m: float, rng: np.random.Generator
     ) -> Position | None:
-        """A place where a camera is not, told with a standard deviation; None if all are near."""
+        """A wrong place for a camera, with a standard deviation; None if all are near."""
         far = [
             node
             for node, pose in self.world_from_node.items()
@@ -145,7 +145,7 @@ class Places:
         return self._clip
 
     def damaged(self, share: float, rng: np.random.Generator) -> Place | None:
-        """The town's map with damaged landmarks, until the next one is asked for."""
+        """The town's map with damaged landmarks, until the next one is requested."""
         self._close(self._damaged)
         path = self.folder / "damaged.engram"
         self._damaged = damaged(self.own, path, share, rng) if self.own else None

@@ -91,7 +91,7 @@ class RealPlan:
 
     @property
     def reverse(self) -> bool:
-        """Never: the cameras keep looking the same way."""
+        """Never: the cameras keep looking in the same direction."""
         return False
 
     def read(self) -> Clip:

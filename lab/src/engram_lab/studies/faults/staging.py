@@ -1,4 +1,4 @@
-"""What a robot meets in a trial: its frames, its map, and what it is told."""
+"""What a robot meets in a trial: its frames, its map, and the positions that it is given."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def drawn(number: int, plans: Sequence[Plan]) -> tuple[str, Plan, np.random.Gene
 
 
 def staged(fault: str, plan: Plan, places: Places, rng: np.random.Generator) -> Scene | None:
-    """The scene of a trial; None without a map, or if it holds no wrong place to be told."""
+    """The scene of a trial; None without a map, or if it holds no wrong place to give."""
     clip, place = places.clip(plan), places.other if fault == OTHER_TOWN else places.own
     start = int(rng.integers(_BEFORE, max(_BEFORE + 1, len(clip) - _AFTER)))
     strength = _strength(fault, rng)
@@ -110,7 +110,7 @@ def _strength(fault: str, rng: np.random.Generator) -> float:
 
 
 def turned_round(forwards: Clip, back: Clip, start: int) -> Clip:
-    """A clip until a frame, and from that place on the clip the other way; its stamps go on."""
+    """A clip until a frame, and from there on the opposite clip; its stamps continue."""
     here = forwards.world_from_cam[start - 1].translation
     off_m = [np.linalg.norm(pose.translation - here) for pose in back.world_from_cam]
     first = int(np.argmin(off_m))

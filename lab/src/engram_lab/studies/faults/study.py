@@ -113,7 +113,7 @@ def available() -> list[Plan]:
 def run(
     file: Path, trials: int, plans: Sequence[Plan] | None = None, monitor: Monitor = QUIET
 ) -> Iterator[Trial]:
-    """Makes the trials up to a number that a file of results lacks, place by place.
+    """Makes the trials up to a number that are missing from a file of results, by place.
 
     Args:
         file: results, a line of JSON each; added to.

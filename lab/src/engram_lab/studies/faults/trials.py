@@ -1,4 +1,4 @@
-"""What came of a trial, and the file of all trials: a line of JSON each."""
+"""The result of a trial, and the file of all trials: a line of JSON each."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MADE_BY = f"method {METHOD_VERSION}, draw {DRAW}"
 
 @dataclass(slots=True)
 class Trial:
-    """What came of one.
+    """Result of one trial.
 
     Attributes:
         number: of the trial.

@@ -96,7 +96,7 @@ _SET_BY_ARMS = (
 
 
 def arms_for(settings: AllSettings) -> tuple[str, ...]:
-    """The arms to run unless told: that of the settings where they set what arms would."""
+    """The arms to run by default: that of the settings where they set what arms would."""
     usual = AllSettings()
     changed = any(
         getattr(getattr(settings, table), name) != getattr(getattr(usual, table), name)

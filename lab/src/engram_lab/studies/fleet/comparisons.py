@@ -23,7 +23,7 @@ from engram_lab.studies.pages import Row, compared_drives
 
 
 def comparison_rows(arm: ArmResult) -> list[Row]:
-    """All of one arm; of the experiments that were asked for."""
+    """All of one arm; of the requested experiments."""
     about = {"campaign": arm.plan.drives.name, "arm": arm.arm.letter}
     of = {7: _building, 8: _sharing, 9: _downloads, 10: _orders}
     return [

@@ -158,7 +158,7 @@ class _Tasks:
         yield self._merged(DOCKED, "r1-first", "r2-first")
 
     def _forays(self, policies: Sequence[str]) -> Iterator[Task]:
-        """The second forays, in downloads of what both know."""
+        """The second forays, in downloads of what both have."""
         for robot, (first, second) in self._plan.forays(self._fold).items():
             for policy in policies:
                 name = f"{robot}-{policy}"
@@ -170,7 +170,7 @@ class _Tasks:
                 yield from self._mapped(name, second, base)
 
     def _sharing(self) -> Iterator[Task]:
-        """Both hand in what they added to their copies; the held-out drives in what comes of it."""
+        """Both hand in what they added to their copies; the held-out drives in the result."""
         yield self._merged("shared-1", DOCKED, "r1-copy")
         yield self._merged(SHARED, "shared-1", "r2-copy")
         yield from self._localised([SHARED])

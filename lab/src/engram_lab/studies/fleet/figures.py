@@ -24,7 +24,7 @@ _P = "P(X ≥ x), %"
 
 
 def draw_fleet_figures(out: Path, arms: Sequence[ArmResult]) -> list[Path]:
-    """Draws every figure that was asked for and for which results are there; returns the files.
+    """Draws every requested figure for which results are there; returns the files.
 
     Raises:
         MissingExtraError: Matplotlib is not installed.

@@ -45,7 +45,7 @@ class _Judge:
 
 
 def try_orders(plan: FleetPlan, arm: Arm, fold: Fold, names: Sequence[str]) -> None:
-    """Merges the groups in all orders, and keeps what came of it in ``orders.json``.
+    """Merges the groups in all orders, and keeps the results in ``orders.json``.
 
     Args:
         plan: the study.

@@ -100,7 +100,7 @@ class Protocol:
         if training < least:
             raise ConfigError(
                 f"{training} training sessions are too few for two robots with two forays each and "
-                f"for {order_groups} groups beside a validation session; {least} are needed"
+                f"for {order_groups} groups and a validation session; {least} are needed"
             )
         validation = max(training // 8, 1)
         return Protocol(
@@ -112,11 +112,11 @@ class Protocol:
 
 @dataclass(frozen=True, slots=True)
 class FleetPlan(StudyPlan[FleetOptions]):
-    """All that a worker needs to know."""
+    """All that a worker needs."""
 
     @property
     def arms(self) -> tuple[Arm, ...]:
-        """Those asked for."""
+        """Those requested."""
         relocaliser = self.options.relocaliser
         return tuple(ARMS[one].under(self.tables, one, relocaliser) for one in self.options.arms)
 

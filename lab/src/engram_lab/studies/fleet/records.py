@@ -1,4 +1,4 @@
-"""What is kept of merges, downloads and drives in the field, beside the maps they made."""
+"""What is kept of merges, downloads and drives in the field, next to the maps they made."""
 
 from __future__ import annotations
 

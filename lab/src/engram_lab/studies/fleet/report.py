@@ -135,7 +135,7 @@ def _exceptions(arm: ArmResult) -> Iterator[str]:
 
 
 def _in_words(arm: ArmResult) -> str:
-    """What is in force in an arm, beside its rows; empty where nothing was run."""
+    """What is in force in an arm, with its rows; empty where nothing was run."""
     known = arm.in_force()
     parts = [in_words(known.get("held out", {}))]
     for name, keys in _SHOWN.items():

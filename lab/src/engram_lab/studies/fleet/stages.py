@@ -147,7 +147,7 @@ def medians(
 
 
 def _stages_of(one: Localisation) -> Iterator[tuple[str, float]]:
-    """What a frame tells about stages; one at which the robot was lost says nothing of attempts."""
+    """The stages of a frame; without attempts if the robot was lost."""
     yield "frame_ms", sum(one.stage_ms.get(stage, 0.0) for stage in _FRAME_STAGES)
     if one.attempts and not one.proposed:
         yield "attempt_ms", one.stage_ms["attempts"] / one.attempts

@@ -63,7 +63,7 @@ def map_drives(
     drives: Sequence[EvaluatedDrive],
     base: str | None = None,
 ) -> None:
-    """Adds drives to a map, one after another, as far as it lacks them.
+    """Adds drives to a map, one after another, as far as they are missing.
 
     Args:
         plan: the study.

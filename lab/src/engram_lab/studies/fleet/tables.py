@@ -55,7 +55,7 @@ def session_rows(arm: ArmResult) -> list[Row]:
 
 
 def _asked(arm: ArmResult, rows: Sequence[Row]) -> list[Row]:
-    """Those of the experiments that are asked for, with what they are about."""
+    """Those of the requested experiments, with what they are about."""
     about = {
         "campaign": arm.plan.drives.name,
         "arm": arm.arm.letter,

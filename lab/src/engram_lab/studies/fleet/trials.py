@@ -159,7 +159,7 @@ def _kept(path: Path) -> list[dict[str, Any]] | None:
 
 
 def _start(plan: FleetPlan, fold: Fold, drive: EvaluatedDrive, opened: Map) -> Position | None:
-    """Where the drive begins, by truth; None where that is not known: it is lost."""
+    """Where the drive begins, by truth; None if unknown: it is lost."""
     truth = drive.truth()
     log = FrameLog(drive.path)
     first = None if truth is None else truth.at(int(log.stamps_ns[0]))
@@ -168,7 +168,7 @@ def _start(plan: FleetPlan, fold: Fold, drive: EvaluatedDrive, opened: Map) -> P
 
 
 def _united(trial: Trial, whole: Sequence[Node], own: Collection[SessionId]) -> int:
-    """Nodes on a robot that keeps all it saved itself beside what was sent."""
+    """Nodes on a robot that keeps all it saved itself in addition to what was sent."""
     mine = sum(node.session in own for node in whole)
     return mine + sum(node.session not in own for node in trial.nodes)
 
