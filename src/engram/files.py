@@ -68,8 +68,8 @@ class Holder:
 
     Attributes:
         pid, host: the process, for people.
-        token: tells one taking of the lock from all others; process ids come again, in containers
-            almost at once.
+        token: distinguishes one taking of the lock from all others; process ids are reused, in
+            containers almost at once.
     """
 
     pid: int

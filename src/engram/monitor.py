@@ -41,7 +41,7 @@ class Relay(Monitor):
     """Another monitor, which receives every report; the work may be stopped here, too.
 
     Whatever wraps a monitor is one of these, or derives from it: a wrapper that passes reports on
-    by hand drops, without a word, those that it does not know of.
+    by hand drops, without a word, those that it does not list.
 
     Args:
         inner: receives every report, those of stages too.

@@ -385,10 +385,10 @@ def test_results_without_the_record_of_their_map_are_told(plan: Plan, tmp_path: 
     shutil.copytree(plan.work, work)
     record = plan.map_path(plan.folds[0]).with_suffix(".json").name
     (work / record).write_text('{"sessions": [{"nam')
-    with pytest.raises(InputError, match=f"{record} does not tell .* remove both"):
+    with pytest.raises(InputError, match=f"{record} does not show .* remove both"):
         collect(replace(plan, work=work))
     (work / record).unlink()
-    with pytest.raises(InputError, match=f"{record} tells of 0 sessions"):
+    with pytest.raises(InputError, match=f"{record} has 0 sessions"):
         collect(replace(plan, work=work))
 
 

@@ -21,7 +21,7 @@ class Cameras:
         topics: names of the left and the right image topic, if the calibration states them.
         right_first: whether the calibration names the right camera first, as cam0.
         sides_doubtful: whether the sign of the baseline says that left and right are exchanged, or
-            is wrong itself: the images tell.
+            is wrong itself: the images show which.
         notes: what was read otherwise than it is written, for people.
     """
 

@@ -23,7 +23,7 @@ class _Held:
 class ResidentMaps:
     """Open maps, for reading, shared by threads.
 
-    What is read of a map once (its log, the nodes that it knows) stays until it has a new revision.
+    What is read of a map once (its log, its nodes) stays until it has a new revision.
     """
 
     def __init__(self) -> None:

@@ -67,8 +67,8 @@ def enrol(
 def run(folder: Folder, *, config: Config = None) -> None:
     """Send and fetch maps until stopped.
 
-    Sends what is queued and fetches the version that the centre wants on this robot. Tells what it
-    does on stderr, a line for each event.
+    Sends what is queued and fetches the version that the centre wants on this robot. Reports each
+    event in a line on stderr.
 
     \b
     Examples:

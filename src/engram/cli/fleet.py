@@ -347,7 +347,7 @@ def build(
 
 
 def _grouping(text: str) -> tuple[str, int]:
-    """Way of grouping and seed.
+    """Method of grouping and seed.
 
     Raises:
         ConfigError: the seed is not a whole number.

@@ -2,7 +2,7 @@
 
 A wrong focal length or baseline bends the scene that a robot measures. Fewer landmarks then fit the
 map, and where they do, the position is off: of a scene 15 m away by 1.5 m for a focal length that
-is wrong by a tenth. As they fit best by the right calibration, the map tells what that is.
+is wrong by a tenth. As they fit best by the right calibration, the map shows what that is.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ class Check:
         unit: of the value.
         message: what is wrong beyond the limit, in words.
         cure: what to do then.
-        advice: the same in the light of what was seen; None where that tells no more.
+        advice: the same in the light of what was seen; None where that adds nothing.
         example: one of the things that are wrong, for the message.
         below: whether values below the limit are the alarm, not those above.
         needs: what the check would need, for the report; "" if not worth reporting.

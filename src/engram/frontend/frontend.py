@@ -166,7 +166,7 @@ def make_thumbnail(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _settings_hash(config: FrontendConfig) -> str:
-    """Of what decides about landmarks; without what came later, as it was before there was that."""
+    """Of what decides about landmarks; without later settings, as before these existed."""
     settings = to_dict(config)
     for later in ("second_threshold", "side_difference"):
         if not settings[later]:

@@ -19,7 +19,7 @@ _MARGIN_PX = 5
 def without_body(pair: StereoPair) -> StereoPair:
     """The pair with the body painted over in the left image, so that it gives no corners.
 
-    The body would otherwise fill the cells of the corner grid beside it. The paint is the mean of
+    The body would otherwise fill the cells of the corner grid next to it. The paint is the mean of
     what is seen, which makes the weakest edge.
     """
     if pair.mask is None:

@@ -42,7 +42,7 @@ def hour_of_day(source: Clocked, stamp_ns: int) -> float | None:
     """Hour of day in [0, 24) at a stamp; None if unknown.
 
     Mean solar time (UTC + longitude / 15) if a longitude is known, else civil time of the zone.
-    None for a clock that is not UTC, and without longitude and a zone that this machine knows:
+    None for a clock that is not UTC, and without longitude or a zone known to this machine:
     drives come from machines with a newer database.
 
     Source: method §2.8.
@@ -90,7 +90,7 @@ def check_longitude(longitude_deg: float | None) -> None:
 
 
 def known_zone(zone: str | None) -> ZoneInfo | None:
-    """The time zone of a name; None for None, and for one that this machine does not know."""
+    """The time zone of a name; None for None, and for a zone unknown to this machine."""
     return _looked_up(zone) if zone is not None and is_zone_name(zone) else None
 
 

@@ -91,7 +91,7 @@ Mark: TypeAlias = Removal | Placement | Anchor | Goal
 
 
 class Removed:
-    """Tells which edges were removed.
+    """Which edges were removed.
 
     Args:
         removals: in any order.

@@ -105,7 +105,7 @@ class Driving:
     Args:
         options: map and robot.
         now: the clock, seconds.
-        watcher: shows each robot that drives; None for nobody.
+        watcher: shows each robot that drives; None to show none.
     """
 
     def __init__(

@@ -190,7 +190,7 @@ class Link:
         """A link to the process that listens at `path`.
 
         Raises:
-            OSError: nobody listens there.
+            OSError: no process listens there.
         """
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
@@ -218,7 +218,7 @@ class Link:
 
         Raises:
             EOFError: the other side closed the link.
-            LinkError: what came is not one JSON object a line, or a line is too long.
+            LinkError: the input is not one JSON object a line, or a line is too long.
             OSError: the link broke.
         """
         lines: list[bytes] = []

@@ -60,7 +60,7 @@ class LiveProcess:
         transport: brings frames and commands.
         options: map and robot.
         now: the clock, seconds.
-        watcher: shows each robot that drives; None for nobody.
+        watcher: shows each robot that drives; None to show none.
     """
 
     def __init__(

@@ -28,7 +28,7 @@ class MapParts:
         graph: the experience graph.
         paths: the path memory.
         frames: where the landmarks of nodes come from.
-        background: what policies may know about the map beyond its graph and paths.
+        background: what policies may use of the map beyond its graph and paths.
         search: stands for the graph's own `neighbourhood`, such as one with a cache that the
             localisers of one drive on a fixed graph share; None for that itself. It is not asked
             where the settings want another search.

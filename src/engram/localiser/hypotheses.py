@@ -39,7 +39,7 @@ class _Hypothesis:
     agreed_m: float = 0.0
 
     def renew(self, position: Position) -> None:
-        """Goes on from a later match that agrees."""
+        """Continues from a later match that agrees."""
         self.position = position
         self.agreed_m += self.driven_m
         self.driven_m = 0.0

@@ -270,7 +270,7 @@ class Localiser:
             self._relocaliser.forget()
 
     def begin(self, session: Session) -> None:
-        """Sets the session of the coming frames; a live robot knows it from its first frame."""
+        """Sets the session of the coming frames; a live robot's begins with its first frame."""
         self._background = replace(
             self._background, sessions={**self._background.sessions, session.id: session}
         )
@@ -543,8 +543,8 @@ class Localiser:
     def _is_known_own(self, index: int, *, own: bool) -> bool:
         """Whether a node is this session's own, and recent or left to loop closure.
 
-        Recent nodes are not candidates (method §3.1). While all motion is measured, the robot knows
-        its pose relative to its own nodes up to drift: a match with one of them is a loop or a
+        Recent nodes are not candidates (method §3.1). While all motion is measured, the robot's pose
+        relative to its own nodes is certain up to drift: a match with one of them is a loop or a
         look-alike, and loop closure asks for a second match.
         """
         node = self._graph.node(index)

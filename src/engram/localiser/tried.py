@@ -53,7 +53,7 @@ class Tried:
         return self._run.attempts(driven_m)
 
     def resume(self, next_iteration: int) -> None:
-        """Goes on with this iteration, without the last ones."""
+        """Continues with this iteration, without the last ones."""
         self._recent = RecentAttempts(self._config, next_iteration)
 
     def begin_frame(self, driven_m: float) -> None:

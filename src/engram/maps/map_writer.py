@@ -100,7 +100,7 @@ class MapWriter(MapReader):
         """Begins to write one drive, in its own revision.
 
         Args:
-            session: the drive; `session_state` tells whether the map has it already.
+            session: the drive; `session_state` shows whether the map has it already.
             camera: the session's camera.
             descriptor: kind of the descriptors of all its frames.
             frontend: hash of the front-end that makes them.

@@ -1,4 +1,4 @@
-"""Opens a map by its path; an empty one is made where asked."""
+"""Opens a map by its path; an empty one is made on request."""
 
 from __future__ import annotations
 

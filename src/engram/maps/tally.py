@@ -1,6 +1,6 @@
 """The tally of tags: how many rows they take, and a digest over them.
 
-Tags belong to no revision, whose row counts what it brought: only the tally tells that a tag is
+Tags belong to no revision, whose row counts what it brought: only the tally shows that a tag is
 gone with its row.
 """
 

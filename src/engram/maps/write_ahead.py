@@ -30,7 +30,7 @@ _GENERATIONS = 2**20
 
 
 def log_problems(path: Path) -> list[str]:
-    """Faults of the log of a database that nobody writes to; empty if there is no log.
+    """Faults of the log of a database without a writer; empty if there is no log.
 
     Args:
         path: the database. Neither it nor its log is opened by SQLite yet, which would fold the

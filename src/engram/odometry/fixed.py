@@ -139,7 +139,7 @@ class FixedLook:
 
     Attributes:
         frame: the frame without the landmarks that are fixed to the camera, or may be.
-        doubted: whether nothing tells which landmarks are the world: those that rest, or those
+        doubted: whether it is open which landmarks are the world: those that rest, or those
             that move.
     """
 
@@ -343,7 +343,7 @@ class FixedPixels:
         """Which landmarks keep their pixels though those behind them do not; none in a world.
 
         A camera that moves moves what is near further than what lies behind it, and one that turns
-        moves both alike. So this tells without knowing how the camera moved.
+        moves both alike. So this decides whatever the camera's motion.
         """
         config, depth_m = self._config, reference.landmarks.points_in_cam[:, 2]
         nothing = np.zeros(len(keeps), np.bool_)

@@ -107,7 +107,7 @@ def equal_share(now: NDArray[np.uint8], before: NDArray[np.uint8]) -> float:
         before: (h, w) uint8 grey.
 
     Returns:
-        The share; 0 where the picture is too dark or too bright to tell.
+        The share; 0 where the picture is too dark or too bright to decide.
     """
     tells = (now > _BLACK) & (now < _WHITE)
     count = np.count_nonzero(tells)

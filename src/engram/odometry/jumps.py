@@ -20,14 +20,14 @@ _GAP_RATIO = 1.5
 
 
 class Jumps:
-    """Tells jumps by the inliers of odometry's steps.
+    """Detects jumps by the inliers of odometry's steps.
 
     Args:
         share: a step with less than this share of the inliers on either side of it is a jump.
         least: fewest inliers on either side: where landmarks are few steps fail by themselves.
 
     Attributes:
-        suspected: whether the last step may be one, which the next step tells.
+        suspected: whether the last step may be one, which the next step decides.
     """
 
     def __init__(self, share: float, least: int) -> None:

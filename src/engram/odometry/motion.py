@@ -189,9 +189,9 @@ class Motion:
         ahead: at an unusable frame, the guess of the motion since the last usable one, with its
             (6, 6) float64 covariance; it is not part of the motion that the next usable frame
             brings.
-        jumped: whether the images went on elsewhere at the frame before, which this one tells:
+        jumped: whether the frame before was taken at a different place, which this one decides:
             where the robot is now does not follow from where it was.
-        suspected: whether they may have gone on elsewhere at this frame, which the next one tells.
+        suspected: whether this frame may be at a different place, which the next one decides.
     """
 
     odometry: OdometryStep

@@ -174,7 +174,7 @@ class OutsideModel:
     def moves(self) -> bool | None:
         """Whether the robot has moved since the last usable frame; None if that is not known.
 
-        A gyroscope alone knows of a turn, but not of standing still.
+        A gyroscope alone detects a turn, but not standing still.
         """
         since = self._since
         if since is None or self._broken or not self.trusted:

@@ -83,7 +83,7 @@ class RunAttempts:
 class RunLog:
     """Collects the attempts of one session as it drives: the last 4,096 of 200 m at most.
 
-    A failure without a prediction is not kept, as it tells nothing: a lost robot has dozens per
+    A failure without a prediction is not kept, as it says nothing: a lost robot has dozens per
     frame.
     """
 

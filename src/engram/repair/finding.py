@@ -35,7 +35,7 @@ class Finding:
         row: its index in the graph's edges.
         why: `contradicted` by the rest of the map, `alone`: nothing confirms it, or `derived`
             from edges that are.
-        off_m, off_rad: disagreement with the rest of the map; 0 where nothing else tells.
+        off_m, off_rad: disagreement with the rest of the map; 0 where nothing else constrains it.
         chi2: the same, squared and normalised.
         sigma_m: the standard deviation that the edge claims, metres.
         confirming, looks: pairs of nodes around it that match as it says, of those tried.

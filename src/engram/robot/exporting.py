@@ -34,7 +34,7 @@ def export_map(
 
     Args:
         path: the map.
-        out: the file; its suffix tells the format unless `form` does.
+        out: the file; its suffix gives the format unless `form` does.
         form: key of `FORMS`.
         at: revision; None for the newest.
 

@@ -53,7 +53,7 @@ class Front:
 
     Args:
         settings: the resolved configuration.
-        camera: that of all its frames; None if the first one tells.
+        camera: that of all its frames; None if the first one decides.
 
     Attributes:
         examination: what the doctor saw of the first frames.
@@ -253,7 +253,7 @@ def check_motion(motion: Motion | OutsideMotion) -> None:
 
     Raises:
         InputError: it is not a rigid motion, too long, or another number is not finite, but for
-            `Motion.guessed_m`: of a motion that nothing tells it is infinite.
+            `Motion.guessed_m`: without any source of motion it is infinite.
     """
     shape: tuple[int, ...]
     if isinstance(motion, OutsideMotion):

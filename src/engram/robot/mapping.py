@@ -85,7 +85,7 @@ class Beginning:
     Attributes:
         opened: the map, open for writing.
         robot: the robot before its first frame.
-        resumed: whether the drive continues an earlier run, so that the robot knows its place.
+        resumed: whether the drive continues an earlier run, so that the robot's position is known.
     """
 
     opened: Map
@@ -114,7 +114,7 @@ def map_drive(
         settings: the resolved configuration, kept with the revision; None for the defaults.
         options: how to map it; None for the defaults.
         monitor: receives the status of each frame, and may stop the drive.
-        begin: called before the first frame, to tell the robot its place or to watch it.
+        begin: called before the first frame, to set the robot's position or to watch it.
         features: required kind of features: "brief", "net", "teblid"; None for that of the frame
             log, the map or the settings, whichever is known first.
 

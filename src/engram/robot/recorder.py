@@ -93,7 +93,7 @@ class Recorder:
         folder: where records go, NAME.flight; made if missing.
         info: facts of the drive.
         about: what is stored with each record, such as the map and its revision.
-        images: whether images are kept; without them a record shows nobody.
+        images: whether images are kept; without them a record shows no people.
         config: settings.
         written: the records, in the order of time.
         failure: why a record could not be written; "" if none failed.

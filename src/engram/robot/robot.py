@@ -333,7 +333,7 @@ class Robot:
     def withdraw(self, found: Localisation) -> None:
         """Withdraws a result that a later frame disproved: no pose rests on it any more.
 
-        The loop calls it for `Localisation.withdraws`, and so may a caller that knows better.
+        The loop calls it for `Localisation.withdraws`, and so may a caller with better evidence.
         """
         time_ns = self._clock.time_of(found.stamp_ns)
         known = (one for one in self.track if one.stamp_ns == time_ns)

@@ -134,11 +134,11 @@ def check_sides(cameras: Cameras, pairs: Iterable[StereoPair], where: object) ->
 
     Args:
         cameras: of the drive.
-        pairs: some of its rectified pairs; read until they tell.
+        pairs: some of its rectified pairs; read until they decide.
         where: the drive, for messages.
 
     Raises:
-        CalibrationError: near things lie further right in the right images, or no image tells.
+        CalibrationError: near things lie further right in the right images, or no image decides.
     """
     if not cameras.sides_doubtful:
         return

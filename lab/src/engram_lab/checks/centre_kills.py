@@ -6,8 +6,8 @@ Service, worker and the agents of two robots run as processes over real sockets.
 hand in, download and switch all the time. One process after another is killed by SIGKILL and starts
 again at once, as a supervisor would have it. Then the day ends by itself: nobody repairs anything.
 At the end every drive is in the fleet map once, and the map is the one that merging the files in
-the order of their hand-ins makes. Each day begins anew and is one line of the file; the same
-command goes on where it stopped.
+the order of their hand-ins makes. Each day begins again and is one line of the file; the same
+command continues where it stopped.
 
 The worker is spared where it died twice without settling anything: three times over one hand-in,
 and the centre gives that hand-in up, as it should.

@@ -9,7 +9,7 @@ where it was not, all nodes that truly stand near are matched with every frame o
 tells whether it could have been found at all. A sample of frames is matched with every node of the
 map, to show that nothing is to be found further away.
 
-OUT keeps the map, one CSV row per start and the summary. The same command goes on where it stopped.
+OUT keeps the map, one CSV row per start and the summary. The same command resumes it.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ python -m engram_lab.checks.doctor --report           # only the table of what w
 
 Limits were set on the clips of `clips.SETTING`; these are others, twenty drives of each of five
 rigs. Each drive is shown as it is, at rest, and with each fault at a strength drawn log-uniformly
-from its stated least one on. Results go to a file as they come; the same command goes on where it
+from its stated least one on. Results go to a file as they come; the same command continues where it
 stopped.
 """
 

@@ -4,8 +4,8 @@
 
 Six robots map one drive each and hand in; the fleet map takes them in the order of time. It dreams
 over three validation drives, and three more, which nothing else sees, are localised in it before
-and after. Each trio has a drive by night, and the validation one in showers. Run again with the
-same folder, the dream goes on where its time ended.
+and after. Each trio has a drive at night, and the validation one in showers. Run again with the
+same folder, the dream continues where its time ended.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ One ring of a town is mapped. Robots drive along the ring beside it, whose front
 switched on there, or told that they are on the mapped one. Every fix is false. Then the ring alone,
 and both rings, are mapped: edges between places that are more than 1 m wrong are counted. Last, a
 later drive is localised on the mapped ring, from a true start. Towns are rendered if they are not
-there yet, session by session: a run that was stopped goes on with the next one.
+there yet, session by session: a run that was stopped continues with the next one.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ of its node. At the end: how true the frame is, component by component, after th
 shift.
 
 With more `--drives` than the campaign has, its drives come again, each round with other frames of
-them: round r takes every r-th. An interrupted run goes on where it was.
+them: round r takes every r-th. An interrupted run continues where it was.
 """
 
 from __future__ import annotations

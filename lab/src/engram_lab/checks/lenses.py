@@ -1,4 +1,4 @@
-"""A robot in a map of another lens: how much of its route it misses, with and without the lens.
+"""A robot in a map of another lens: how much of its route it misses, with the lens known or not.
 
     python -m engram_lab.checks.lenses TOWN...      # folders of frame logs
 

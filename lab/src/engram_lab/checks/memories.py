@@ -2,7 +2,7 @@
 
     python -m engram_lab.checks.memories SEED SESSION...     # of `longer_trial_town`
 
-Three drives of the town are mapped: by day, by night, and in rain at night. Four more robots each
+Three drives of the town are mapped: by day, at night, and in rain at night. Four more robots each
 take a copy of that map, localise in it, and hand in what they remember. The named drives are then
 localised in the fleet map with and without these memories: by `path` as published, with one attempt
 a frame and with two as in [L15], each also with the paper's settings, by `path-near` with two, and

@@ -163,7 +163,7 @@ def add_drive(made: RandomMap, number: int, rng: random.Random) -> None:
 
 
 def add_edge(made: RandomMap, a: NodeId, b: NodeId, kind: str) -> None:
-    """An edge that tells the truth: places are a metre apart."""
+    """A true edge: places are a metre apart."""
     if a == b:
         return
     ahead_m = float(made.nodes[b][1] - made.nodes[a][1])

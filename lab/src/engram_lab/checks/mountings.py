@@ -3,7 +3,7 @@
     python -m engram_lab.checks.mountings SEED SESSION...     # of `longer_trial_town`
 
 The first drive of the town is mapped. Each named drive is localised there twice: as it is, and
-rendered anew through a camera that is mounted 0.5 m higher and 0.3 m aside, pitched down by 10°.
+rendered again through a camera that is mounted 0.5 m higher and 0.3 m aside, pitched down by 10°.
 """
 
 from __future__ import annotations

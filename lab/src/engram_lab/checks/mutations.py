@@ -6,7 +6,7 @@
 Each case is a change of a sound file, drawn by its number, and read in a child in every way that
 users read it. Crashes, hangs (10 s; of texts 2 s), more than 1 GB (of texts 200 MB), exceptions
 that are not Engram's own, code of the file that ran, and changes that no check sees are faults.
-Results go to a file as they come; the same command goes on where it stopped.
+Results go to a file as they come; the same command continues where it stopped.
 """
 
 from __future__ import annotations

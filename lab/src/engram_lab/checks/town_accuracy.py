@@ -6,7 +6,7 @@
     python -m engram_lab.checks.town_accuracy disparity --laps 1 --every 40
 
 Drift is KITTI's measure: the error over stretches of 100, 200 and 300 m ÷ their length, one from
-every tenth frame on; the median of each lap, and the median over laps by day and by night.
+every tenth frame on; the median of each lap, and the median over laps by day and at night.
 
 Disparity: a landmark on the edge of a thing lies, to less than a pixel, on one of two surfaces, and
 the truth at the pixel's centre is the other one's as often as not. So the nearest truth among the

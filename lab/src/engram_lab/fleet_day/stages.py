@@ -10,7 +10,7 @@ from engram.monitor import Monitor, Relay
 
 
 class Stages(Relay):
-    """Tells each stage as it begins, and how long it took when it ends.
+    """Reports each stage as it begins, and how long it took when it ends.
 
     Args:
         inner: hears of every item.

@@ -53,7 +53,7 @@ class PathKinds(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """One way to localise the held-out sessions; where it says nothing, the settings do.
+    """One way to localise the held-out sessions; what it leaves out, the settings give.
 
     Attributes:
         policy: name of a ranking policy.

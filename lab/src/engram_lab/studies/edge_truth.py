@@ -20,7 +20,7 @@ class EdgeError:
     Attributes:
         kind: origin of the edge.
         error_m: how far off it is, metres.
-        joins_places: whether it joins two places, which spoils a map for good. Where odometry had
+        joins_places: whether it joins two places, which ruins a map. Where odometry had
             lost track, edges are far off and say so.
     """
 

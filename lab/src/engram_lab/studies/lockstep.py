@@ -234,7 +234,7 @@ def _note(
 
 
 class _Placing(Keeper):
-    """Knows where the drive starts, and keeps nothing."""
+    """Supplies where the drive starts, and keeps nothing."""
 
     def __init__(self, situation: Situation) -> None:
         self._start = situation.start

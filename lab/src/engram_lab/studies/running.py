@@ -141,7 +141,7 @@ def run(plan: Plan, workers: int = 1, monitor: Monitor = QUIET) -> None:
     """Builds, runs, and leaves the results in the plan's folder; what is there is kept.
 
     Fold by fold: sessions are run as soon as their map is built. Results do not depend on the
-    number of workers. Killed or interrupted, the same call goes on.
+    number of workers. Killed or interrupted, the same call continues.
 
     Args:
         plan: what to run.

@@ -93,7 +93,7 @@ def simulate(
 ) -> SimulateReport:
     """Renders a campaign's sessions that are not there yet.
 
-    Odometry that has changed is run anew over the landmarks of sessions that are there. Of logs of
+    Odometry that has changed is run again over the landmarks of sessions that are there. Of logs of
     before the front-end's second look only those are rendered again in which a frame would get one.
 
     Frame logs stand as `NAME.framelog` with `NAME.truth.txt` beside them; images in KITTI's

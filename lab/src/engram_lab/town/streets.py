@@ -178,7 +178,7 @@ class Route:
     beside: Route | None = None
 
     def streets(self) -> Iterator[Street]:
-        """The streets it uses, in order, each with its smaller junction first; then the next ring's."""
+        """The streets it uses, each with its smaller junction first, then the next ring's."""
         for k, start in enumerate(self.junctions):
             end = self.junctions[(k + 1) % len(self.junctions)]
             yield (min(start, end), max(start, end))

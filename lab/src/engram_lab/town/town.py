@@ -1,8 +1,8 @@
 """A town to drive in: blocks of houses, parks and squares, made tile by tile from a seed.
 
 A tile is one block with the pavement around it and the streets on its south and west sides. What
-stands for good (`build_tile`) is kept apart from what the season changes and from what is only
-there today, so that a day's drive builds anew only what differs.
+is permanent (`build_tile`) is kept apart from what the season changes and from what is only
+there today, so that a day's drive rebuilds only what differs.
 """
 
 from __future__ import annotations

@@ -173,7 +173,7 @@ def subject_of(centre: Centre, token: str) -> Subject:
     """Who holds a token.
 
     Raises:
-        NotKnownError: nobody, or it has expired.
+        NotKnownError: the token is unknown, or has expired.
     """
     with centre.database.reading() as connection:
         row = first_row(connection, select(tokens).where(tokens.c.hash == _hash(token)))
@@ -198,7 +198,7 @@ def take_away(centre: Centre, name: str, by: str) -> list[str]:
         Their ids.
 
     Raises:
-        UnknownError: nobody has this name.
+        UnknownError: no person or robot has this name.
         InputError: several robots have it.
     """
     called = (subjects.c.name == name) | (subjects.c.id == name)
@@ -208,7 +208,7 @@ def take_away(centre: Centre, name: str, by: str) -> list[str]:
     if len(alike) > 1:
         raise InputError(f"{len(alike)} robots are called {name!r}; name one by its id: {alike}")
     if not found:
-        raise UnknownError(f"nobody called {name!r:.60} has a token")
+        raise UnknownError(f"{name!r:.60} has no token")
     for one in found:
         disable(centre, one["id"], by)
     return [one["id"] for one in found]

@@ -29,7 +29,7 @@ def who_asks(request: Request) -> Subject:
     """Who holds the token of a request.
 
     Raises:
-        NotKnownError: nobody does.
+        NotKnownError: the request is not authenticated.
     """
     kind, _, token = request.headers.get("authorization", "").partition(" ")
     if kind.lower() != "bearer":

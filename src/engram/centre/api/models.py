@@ -27,7 +27,7 @@ class Enrolment(Body):
 
 
 class Enrolled(BaseModel):
-    """The robot as the centre knows it."""
+    """The robot's record at the centre."""
 
     robot: Annotated[str, Field(examples=[_ID])]
     maps: Annotated[list[str], Field(examples=[["fleet"]])]

@@ -12,7 +12,7 @@ _TELL_S = 1.0
 
 
 class Watching(Monitor):
-    """Tells how far a job is, and stops it if it is cancelled.
+    """Reports the progress of a job, and stops it if it is cancelled.
 
     Args:
         tell: notes the progress; returns whether the job is to be cancelled.

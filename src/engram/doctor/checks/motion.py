@@ -64,7 +64,7 @@ def frozen_frames(seen: Evidence) -> float | None:
 def scale_off(seen: Evidence) -> float | None:
     """How far odometry's scale is from that of motion from outside, as a share.
 
-    None where odometry is too unsure to tell: in rain its steps are uncertain, and too short.
+    None where odometry is too unsure to decide: in rain its steps are uncertain, and too short.
     """
     ways: list[tuple[float, float]] = []
     nowhere = SE3.identity(), SE3.identity(), 0.0

@@ -96,7 +96,7 @@ def frames_late(seen: Evidence) -> float | None:
 
 
 def forward_m(seen: Evidence) -> float | None:
-    """Way between the instants of left and right: the median over pairs that moved."""
+    """Distance between the instants of left and right: the median over pairs that moved."""
     ways = [
         abs(one.forward_m) if abs(one.forward_m) > _SIGNIFICANT * one.sigma_m else 0.0
         for one in _alignments(seen)

@@ -33,7 +33,7 @@ def affinities(stock: Stock, basin: MatchBasin) -> Array:
 
     Estimated from remembered attempts, or from the matches on a path if no attempts were kept. A
     pair with few attempts falls back on the average for its difference in hours, scaled by how
-    well e served the others. Thus drives in rain or at night that nobody matched get a low value.
+    well e matched the others. Thus drives in rain or at night that were never matched score low.
     """
     count = len(stock.sessions)
     won, expected = tallies(stock, basin)

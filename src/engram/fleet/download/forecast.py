@@ -104,7 +104,7 @@ class Forecast:
             expected: share of the route without a match by `Coverage`.
             lost: of that, by nodes that are left out.
             drives: sessions in the map.
-            light: whether the map knows the mission's light.
+            light: whether the map contains drives in the mission's light.
         """
         place = int(np.digitize(lost, BINS[1:-1]))
         missed: dict[Weather, Interval | None] = dict.fromkeys(Weather)

@@ -42,7 +42,7 @@ class UpdateReport:
         out: the robot's map.
         select: key of `SELECTIONS`.
         source_revision: of the fleet map.
-        revision: the new one of the robot's map; None if it lacked nothing.
+        revision: the new one of the robot's map; None if nothing was missing.
         content_hash: of the robot's map.
         nodes, of_nodes: copied; those of the download.
         own_nodes: nodes of the robot's map that the download does not have.
@@ -162,7 +162,7 @@ class _Update:
         )
 
     def write(self, about: dict[str, Any], monitor: Monitor) -> int | None:
-        """Writes what is lacking, as one revision; returns its number, None if nothing was."""
+        """Writes what is missing, as one revision; returns its number, None if nothing was."""
         with self._map.begin_revision(**about) as writer:
             anything = self._write_owners(writer, monitor)
             if writer.shows_again:

@@ -20,7 +20,7 @@ from engram.robot import Settings
 
 @dataclass(frozen=True, slots=True)
 class Try:
-    """One way of merging, to be tried in all orders.
+    """One method of merging, to be tried in all orders.
 
     Attributes:
         place: folder of its results; what is there already is not tried again.
@@ -55,7 +55,7 @@ class _Deadline:
 
 
 def try_orders(asked: Try, monitor: Monitor) -> bool:
-    """Tries the orders of one way of merging; whether it came to the end.
+    """Tries the orders of one method of merging; whether it came to the end.
 
     Raises:
         KeyboardInterrupt: the monitor stopped it, rather than the time.

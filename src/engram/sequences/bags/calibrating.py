@@ -333,7 +333,7 @@ def _info(topic: str, message: Any, size: tuple[int, int] | None, *, rectified: 
 def _cut_out(info: CameraInfo, message: Any, size: tuple[int, int] | None) -> CameraInfo:
     """The camera of the images that are sent: a region of the sensor, its pixels joined.
 
-    Some drivers state a region or binning and send whole images; the size of the images tells.
+    Some drivers state a region or binning and send whole images; the size of the images decides.
     """
     roi, joined = message.roi, (max(message.binning_x, 1), max(message.binning_y, 1))
     region = (int(roi.width) or info.width, int(roi.height) or info.height)

@@ -67,7 +67,7 @@ class BagFile(Protocol):
         """The topics by name.
 
         Args:
-            lost: is told what cannot be read.
+            lost: receives what cannot be read.
 
         Raises:
             DamageError: the file is of another kind, or nothing can be read.
@@ -79,7 +79,7 @@ class BagFile(Protocol):
 
         Args:
             topics: names of topics; records of others are passed over undecoded.
-            lost: is told what cannot be read.
+            lost: receives what cannot be read.
         """
         ...
 
