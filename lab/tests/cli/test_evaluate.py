@@ -54,4 +54,4 @@ def test_a_campaigns_name_is_the_campaign_though_a_folder_has_it_too(
     assert ran.status == 2
     assert "sessions are not rendered" in ran.err
     other = engram("lab", "evaluate", "ranking", "hamlet/", "--campaigns", tmp_path / "none")
-    assert "is no frame log" in other.err
+    assert "is not a frame log" in other.err

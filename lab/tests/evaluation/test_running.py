@@ -291,7 +291,7 @@ def test_logs_without_truth_are_localised_and_have_no_errors(tmp_path: Path) -> 
     assert all(row["median_error_m"] == row["false_successes"] == "" for row in rows)
     assert all(0 < float(row["share_not_localised"]) < 0.6 for row in rows if row["lanes"] == "2")
     page = (tmp_path / "out" / "report.md").read_text()
-    assert "The truth of NAME.framelog is NAME.truth.txt beside it, in TUM format." in page
+    assert "The truth of NAME.framelog is NAME.truth.txt next to it, in TUM format." in page
 
 
 def test_a_drive_with_truth_among_others_without_is_localised(tmp_path: Path) -> None:

@@ -154,7 +154,7 @@ class Centre:
             self._follow_file(connection, name, by)
 
     def _follow_file(self, connection: Connection, name: str, by: str) -> None:
-        """Makes the tables of a map say what its file holds, if an older one was put back.
+        """Makes the tables of a map say what its file holds, if an older one was restored.
 
         Hand-ins merged into later revisions are open again, so that their robots send them again.
         """

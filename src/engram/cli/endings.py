@@ -37,7 +37,7 @@ class ExitStatus(IntEnum):
         "trust the result",
     )
     INTERRUPTED = 130, "interrupted"
-    READER_LEFT = 141, "nobody reads the output"  # as of a program that SIGPIPE ends
+    READER_LEFT = 141, "the reader closed the output"  # as of a program that SIGPIPE ends
 
 
 def untrusted_if(fatal: Sequence[Finding]) -> None:

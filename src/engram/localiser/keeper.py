@@ -19,7 +19,7 @@ class Hint:
             localiser's own count.
         guessed_m: standard deviation of the motion guessed since then, metres; infinite if the
             robot is only roughly known and must be found again.
-        agreed: number of fixes that confirm the position; 0 if it is only said to be.
+        agreed: number of fixes that confirm the position; 0 if only the caller supplied it.
         found: an earlier result for this frame, which is then not localised again.
     """
 

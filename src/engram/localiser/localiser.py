@@ -372,7 +372,7 @@ class Localiser:
 
         A frame that odometry could not use changes nothing: the next usable one carries the motion
         since the last. The robot is lost once the uncertainty of guessed motion exceeds
-        `LocaliserConfig.greatest_gap_m`, and if the images went on elsewhere.
+        `LocaliserConfig.greatest_gap_m`, and if a frame was taken at a different place.
         """
         self._motion = motion
         if motion.prev_from_curr is None or motion.covariance is None:
@@ -543,9 +543,9 @@ class Localiser:
     def _is_known_own(self, index: int, *, own: bool) -> bool:
         """Whether a node is this session's own, and recent or left to loop closure.
 
-        Recent nodes are not candidates (method §3.1). While all motion is measured, the robot's pose
-        relative to its own nodes is certain up to drift: a match with one of them is a loop or a
-        look-alike, and loop closure asks for a second match.
+        Recent nodes are not candidates (method §3.1). While all motion is measured, the pose
+        relative to them is certain up to drift: a match with one of them is a loop or a look-alike,
+        and loop closure requires a second match.
         """
         node = self._graph.node(index)
         if node.session != self._own_session:

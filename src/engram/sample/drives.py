@@ -46,7 +46,7 @@ def write_drives(folder: Path, monitor: Monitor = QUIET) -> None:
 
     Args:
         folder: made where there is none.
-        monitor: hears of every file.
+        monitor: receives the progress, file by file.
 
     Raises:
         InputError: something else has a drive's name, or the folder cannot be written to.

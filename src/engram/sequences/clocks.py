@@ -394,7 +394,7 @@ class SteadyClock:
         return self._placed(chain, step)
 
     def _unnoticed(self, last: _Stamp, first: _Stamp) -> bool:
-        """Whether a recorder went on receiving while the clock jumped forwards."""
+        """Whether a recorder kept receiving while the clock jumped forwards."""
         if last.received_ns is None or first.received_ns is None or not self._received_ns:
             return False
         per_item_ns = (first.received_ns - last.received_ns) / (first.number - last.number)

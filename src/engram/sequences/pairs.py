@@ -64,7 +64,7 @@ class _Pairing:
         self._intervals_ns: deque[int] = deque(maxlen=_NEWEST_INTERVALS)
 
     def next_left(self, item: Timed[L]) -> None:
-        """Hears of the next left item."""
+        """Counts the next left item."""
         self._loose = self._loose or item.step is not None
         if self._last_ns is not None:
             self._intervals_ns.append(item.time_ns - self._last_ns)

@@ -75,7 +75,7 @@ def main() -> None:
     given = parser.parse_args()
     logs = [log for one in given.folders for log in sorted(one.glob("*.framelog"))][: given.drives]
     if len(logs) < given.drives:
-        parser.error(f"the folders hold {len(logs)} logs, {given.drives} were asked for")
+        parser.error(f"the folders hold {len(logs)} logs, {given.drives} were requested")
     report(compared(given.against.resolve(), logs, given.pairs), given.json, "builds")
 
 

@@ -8,8 +8,8 @@
 
 Reports of each drive what was localised and saved; then, of each kind of edge, how many are off by
 more than a metre, and how many join two places: more than 5 m off, and more than three of their own
-standard deviations. Such an edge ruins a map; where odometry had lost track in the rain,
-edges are far off and say so. Last, of a robot that stands at each of 150 nodes drawn at random and
+standard deviations. Such an edge ruins a map; where odometry had lost track in the rain, edges
+are far off and say so. Last, of a robot that stands at each of 150 nodes drawn at random and
 knows where it is: how many candidates it has, how many of them are elsewhere, and which share of
 the nodes that truly are near is among them.
 """

@@ -87,7 +87,7 @@ class Training:
             )
 
     def load(self, file: Path) -> None:
-        """Goes on from a checkpoint."""
+        """Continues from a checkpoint."""
         kept = torch.load(file, weights_only=True)
         self.network.load_state_dict(kept["network"])
         self._optimiser.load_state_dict(kept["optimiser"])

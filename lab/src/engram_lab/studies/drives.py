@@ -181,7 +181,7 @@ def drives_of(paths: Sequence[Path]) -> tuple[EvaluatedDrive, ...]:
     """Frame logs as drives, in the order of time.
 
     Raises:
-        SequenceError: one is no frame log, was not recorded to its end, is there twice, or its
+        SequenceError: one is not a frame log, was not recorded to its end, is there twice, or its
             truth cannot be read.
         IncompatibleError: they have different kinds of descriptors.
     """
@@ -202,7 +202,7 @@ def drives_of(paths: Sequence[Path]) -> tuple[EvaluatedDrive, ...]:
 
 def _drive(path: Path) -> EvaluatedDrive:
     if path.suffix != ".framelog":
-        raise SequenceError(f"{path}: is no frame log; make one with: engram record {path}")
+        raise SequenceError(f"{path}: is not a frame log; make one with: engram record {path}")
     log = FrameLog(path)
     try:
         if not log.complete:

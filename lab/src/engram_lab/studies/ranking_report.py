@@ -54,7 +54,7 @@ _USED = {one.name for one in fields(Settings)} | {"drive"}
 _SHOWN_SIZES = 8
 _NO_TRUTH = (
     "Not every drive has its truth: no pose errors, no false successes. The truth of NAME.framelog "
-    f"is NAME{TRUTH_SUFFIX} beside it, in TUM format."
+    f"is NAME{TRUTH_SUFFIX} next to it, in TUM format."
 )
 _POLICY_COLUMNS = {
     "label": "policy",

@@ -52,7 +52,7 @@ def enrol(centre: Centre, code: str, name: str, public_key: bytes, signature: by
 
     Raises:
         NotAllowedError: the code is unknown, expired, or used by another robot, or the robot was
-            taken away.
+            removed.
         InputError: the signature is not of this key.
     """
     check_signature(public_key, signature, enrolment_text(code))

@@ -151,7 +151,7 @@ def _thin_map(centre: Centre, row: dict[str, Any]) -> Path:
 
 @contextmanager
 def _scratch(path: Path) -> Iterator[None]:
-    """Takes away what a file and its locks leave, before and after."""
+    """Removes what a file and its locks leave, before and after."""
     _clear(path)
     try:
         yield

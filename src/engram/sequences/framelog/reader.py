@@ -65,8 +65,8 @@ class FrameLog:
     """A `FrameSequence` over a frame log. Frames are decoded on demand.
 
     With a range of frames, odometry is composed over the frames left out; if one of those steps
-    failed, the composed step fails too. With `skip_bad`, damaged frames are left out in the same
-    way, and counted.
+    failed, the composed step fails too. With `skip_bad`, damaged frames are left out, too, and
+    counted.
 
     Raises:
         SequenceError: the file is not a frame log, or no frame of it is chosen.
