@@ -154,7 +154,7 @@ def check_bounds(config: Any) -> None:
 
 
 def _bounds(hint: Any) -> tuple[Any, ...]:
-    """What is declared of a field, or of what it is unless it is None."""
+    """The metadata declared with a field, or with the other arm of an optional one."""
     if typing.get_origin(hint) in {typing.Union, types.UnionType}:
         hint = hint.__args__[0]
     return getattr(hint, "__metadata__", ())

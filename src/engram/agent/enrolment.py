@@ -57,7 +57,7 @@ def enrol(folder: Path, url: str, code: str, name: str, client: httpx.Client | N
 
 
 def signer_of(key: Path) -> Signer:
-    """What signs with a robot's key.
+    """A signer with a robot's key.
 
     Raises:
         InputError: it is missing, or not one.
@@ -71,7 +71,7 @@ def signer_of(key: Path) -> Signer:
 
 
 def enrolled(folder: Path) -> AgentState:
-    """What an agent remembers.
+    """Opens the state of an agent.
 
     Raises:
         InputError: the robot is not enrolled, or only half.

@@ -189,7 +189,7 @@ def _out_of_reach(error: Exception) -> Unreachable:
 
 
 def _content(answer: httpx.Response) -> Any:
-    """What an answer says.
+    """The JSON of an answer.
 
     Raises:
         Unreachable: something else answers, as the login page of a network does.

@@ -1,4 +1,4 @@
-"""What an agent may use, and when it falls back."""
+"""Limits of an agent, and when it falls back."""
 
 from __future__ import annotations
 
@@ -19,20 +19,23 @@ class AgentSettings:
     """
 
     download: dict[str, Any] = field(default_factory=dict)
-    bytes_per_s: Annotated[float, Meta(gt=0, description="of the link; none: all")] | None = None
+    bytes_per_s: (
+        Annotated[float, Meta(gt=0, description="bandwidth limit; none: no limit")] | None
+    ) = None
     outbox_bytes: Annotated[
-        int, Meta(ge=0, description="disk for hand-ins that the centre has not kept yet, bytes")
+        int, Meta(ge=0, description="disk for hand-ins that the centre has not stored yet, bytes")
     ] = 10 * 2**30
     first_retry_s: Annotated[float, Meta(gt=0, description="wait after a failure, s")] = 2.0
     longest_retry_s: Annotated[
         float, Meta(gt=0, description="each wait is twice the one before, up to this, s")
     ] = 600.0
-    idle_s: Annotated[float, Meta(gt=0, description="between two rounds without work, s")] = 30.0
+    idle_s: Annotated[float, Meta(gt=0, description="pause between rounds without work, s")] = 30.0
     judged_m: Annotated[
         float, Meta(ge=0, description="a new map is judged after driving this far, m")
     ] = 50.0
     least_share: Annotated[
-        float, Meta(ge=0, le=1, description="of frames localised; below it the last map comes back")
+        float,
+        Meta(ge=0, le=1, description="share of frames localised below which the last map returns"),
     ] = 0.2
 
     def __post_init__(self) -> None:

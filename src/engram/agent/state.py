@@ -1,4 +1,4 @@
-"""What an agent remembers: one SQLite file, so that a kill leaves it before or after a step."""
+"""The state of an agent: one SQLite file, so that a kill leaves it before or after a step."""
 
 from __future__ import annotations
 

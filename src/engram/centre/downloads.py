@@ -113,7 +113,7 @@ class Downloads:
         return decode_manifest(self._centre.objects.get(key))
 
     def parts(self, row: dict[str, Any], wanted: list[PartHash]) -> Iterator[bytes]:
-        """Those of the wanted parts that the artifact consists of; no others."""
+        """The requested parts that belong to the artifact."""
         manifest, packs = self.ready(row), self._centre.packs(row["map"])
         pages = set(manifest.hashes())
         if any(one not in pages for one in wanted):

@@ -13,7 +13,7 @@ class CentreError(EngramError):
 
 
 class UnknownError(CentreError):
-    """There is no such thing, or not for the one who asks."""
+    """The resource does not exist, or not for the caller."""
 
     status = 404
     title = "Not found"
@@ -27,14 +27,14 @@ class NotKnownError(CentreError):
 
 
 class NotAllowedError(CentreError):
-    """Who asks may not do that."""
+    """The caller may not do that."""
 
     status = 403
     title = "Not allowed"
 
 
 class ChangedError(CentreError):
-    """What the request was made for has changed meanwhile."""
+    """The subject of the request has changed since."""
 
     status = 412
     title = "Changed meanwhile"
@@ -48,7 +48,7 @@ class ConflictError(CentreError):
 
 
 class MalformedError(CentreError):
-    """What was sent makes no map."""
+    """The uploaded parts do not make a valid map."""
 
     status = 422
     title = "No map"

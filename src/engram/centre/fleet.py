@@ -41,7 +41,7 @@ class Fleet:
         return [{**row, "report": json.loads(row["report"])} for row in rows]
 
     def wanted(self, name: str, robot: str) -> dict[str, Any]:
-        """What a robot is to run: its ref, the revision, and what it may forget.
+        """The version that a robot is to run: its ref, the revision, and what it may drop.
 
         Where its ref is not made yet, or was removed, that is revision 0: it stays where it is, and
         hands in, since the first hand-in may be what makes the ref.

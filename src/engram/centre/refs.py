@@ -20,7 +20,7 @@ _NAME = re.compile(r"[a-z][a-z0-9._-]{0,39}")
 
 
 def check_followed(followed: str) -> None:
-    """That a robot can follow it: `head`, a number, or the name of a ref, made now or later.
+    """Checks that a robot can follow it: `head`, a number, or a ref's name, made now or later.
 
     Raises:
         InputError: no ref is ever called so.
@@ -33,7 +33,7 @@ def check_followed(followed: str) -> None:
 
 
 def check_movable(ref: str) -> None:
-    """That a ref can be called so, and moved.
+    """Checks that a ref may have this name, and may be moved.
 
     Raises:
         InputError: it cannot.

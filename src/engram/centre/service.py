@@ -110,7 +110,7 @@ class Centre:
         self.database.close()
 
     def words_of(self, error: Exception) -> str:
-        """What an error says, for robots and people: not where on its machine the centre lies."""
+        """The message of an error, for robots and people: without paths of the centre's machine."""
         return str(error).replace(f"{self.folder}{os.sep}", "")
 
     def fault_of(self, error: Exception) -> str:

@@ -15,27 +15,31 @@ _GIB = 2**30
 
 @dataclass(frozen=True, slots=True)
 class CentreSettings:
-    """What a centre grants to whom, and for how long."""
+    """Limits and deadlines of a centre."""
 
     token_s: Annotated[int, Meta(ge=10, description="life of a robot's token, s")] = 900
     nonce_s: Annotated[
         int, Meta(ge=1, description="time to sign the nonce of a token request, s")
     ] = 60
     code_days: Annotated[int, Meta(ge=1, description="life of an enrolment code, days")] = 7
-    bytes_a_day: Annotated[int, Meta(ge=0, description="a robot may hand in, bytes a day")] = (
+    bytes_a_day: Annotated[int, Meta(ge=0, description="upload limit of a robot, bytes a day")] = (
         20 * _GIB
     )
-    handin_bytes: Annotated[int, Meta(ge=0, description="of one hand-in, bytes")] = 8 * _GIB
-    open_handins: Annotated[int, Meta(ge=1, description="incomplete ones of a robot at once")] = 8
+    handin_bytes: Annotated[int, Meta(ge=0, description="size limit of one hand-in, bytes")] = (
+        8 * _GIB
+    )
+    open_handins: Annotated[
+        int, Meta(ge=1, description="incomplete hand-ins of a robot at once")
+    ] = 8
     handin_days: Annotated[int, Meta(ge=1, description="life of an incomplete hand-in, days")] = 14
     kept_days: Annotated[
         int,
-        Meta(ge=0, description="life of parts that nothing needs, days"),
+        Meta(ge=0, description="life of unused parts, days"),
     ] = 14
     artifact_days: Annotated[int, Meta(ge=1, description="life of an unused download, days")] = 30
     sweep_h: Annotated[float, Meta(gt=0, description="time between sweeps, h")] = 24.0
     merge_tries: Annotated[
-        int, Meta(ge=1, description="times that a worker may die over one hand-in")
+        int, Meta(ge=1, description="times that a worker may die while merging one hand-in")
     ] = 3
     admission_bytes: Annotated[int, Meta(ge=2**28, description="memory of admission, bytes")] = (
         4 * _GIB

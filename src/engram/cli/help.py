@@ -19,7 +19,7 @@ class Verb(TyperCommand):
     _EXPLAINED = "Also for drives, explained by engram drive info --help"
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """What follows the verb in the line of usage."""
+        """The arguments in the line of usage."""
         del ctx
         arguments = [_typed(one) for one in self.params if one.param_type_name == "argument"]
         return [self.options_metavar or "", *arguments]

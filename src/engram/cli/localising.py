@@ -134,7 +134,7 @@ def _recorder(opened: Map, sequence: Drive, outputs: Outputs) -> Recorder | None
 
 
 def _records(recorder: Recorder | None) -> dict[str, Any]:
-    """What ``--json`` prints of a recorder; says why a record is missing."""
+    """The ``--json`` of a recorder; says why a record is missing."""
     if recorder is None:
         return {}
     if recorder.failure:

@@ -66,7 +66,7 @@ class Screen(io.TextIOBase):
 
 
 class UnwritableError(Exception):
-    """What is printed cannot be written: the disk is full, or the reader went away."""
+    """The output cannot be written: the disk is full, or the reader has closed it."""
 
     def __init__(self, cause: OSError) -> None:
         super().__init__(f"the output cannot be written: {cause.strerror}")

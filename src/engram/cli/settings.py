@@ -41,7 +41,7 @@ class DriveSettings:
             int,
             Meta(
                 ge=1,
-                description="most threads of a robot, that of its loop included; none: one for "
+                description="most threads of a robot, its loop included; none: one for "
                 "each lane, and 2 to 4 that decode, read ahead, write and close loops",
             ),
         ]
@@ -71,7 +71,7 @@ class BuildSettings:
 
 @dataclass(frozen=True, slots=True)
 class DownloadSettings:
-    """What the selections of `download` go by."""
+    """Settings of the selections of `download`."""
 
     window_min: Annotated[
         float, Meta(ge=0, le=720, description="tod: minutes around departure. Source: [G16] §VI-D")
@@ -224,7 +224,7 @@ def every_setting(settings: Any, tables: str = "") -> Iterator[Setting]:
 
 
 def _documented(kind: type) -> dict[str, str]:
-    """What the docstring of a configuration says of each of its attributes."""
+    """Descriptions of a configuration's attributes, from its docstring."""
     _, _, section = (inspect.getdoc(kind) or "").partition("Attributes:\n")
     found = {}
     for entry in re.split(r"\n {4}(?=\w)", "\n" + section.split("\n\n")[0]):

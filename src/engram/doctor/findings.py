@@ -1,4 +1,4 @@
-"""What an examination of a drive comes to: findings, each with value, limit and cure."""
+"""Result of examining a drive: findings, each with value, limit and cure."""
 
 from __future__ import annotations
 

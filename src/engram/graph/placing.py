@@ -68,12 +68,9 @@ class PlacingConfig:
         ),
     ] = 5.0
     moved_m: Annotated[
-        float, Meta(ge=0, description="a repair leaves nodes where they are that it would move "
-                    "by less, m")
+        float, Meta(ge=0, description="a repair does not move nodes by less than this, m")
     ] = 1.0  # fmt: skip
-    same_m: Annotated[float, Meta(gt=0, description="movements below it are not written, m")] = (
-        0.001
-    )
+    same_m: Annotated[float, Meta(gt=0, description="smaller movements are not written, m")] = 0.001
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -357,7 +354,7 @@ class _Placing:
         return follow_chains(poses, self.edges, self.ends, (~fixed, fixed))
 
     def _level(self) -> Priors:
-        """That cameras stand upright on the ground, as their motion shows."""
+        """Priors that cameras stand upright on the ground, as their motion shows."""
         nothing = Priors.none(len(self.ups))
         return replace(nothing, ups=self.ups, level_rad=self.config.level_rad)
 

@@ -59,7 +59,7 @@ class LiveOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """What one frame gave.
+    """Result of one frame.
 
     Attributes:
         motion: motion since the previous usable frame; None if the frame was not taken.

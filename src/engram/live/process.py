@@ -37,7 +37,7 @@ _SILENT_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What the process says of itself, five times a second.
+    """The status message of the process, five times a second.
 
     Attributes:
         status: `starting`, `no images`, `fault`, or the status of the newest frame.

@@ -195,7 +195,7 @@ class _Images:
 
 
 def _outside(message: Mapping[str, Any]) -> Outside | None:
-    """What wheels and gyroscope say of a frame; None for nothing."""
+    """The motion of a frame by wheels and gyroscope; None without any."""
     wheels, gyro = message.get("wheels_from_live"), message.get("gyro_from_live")
     if wheels is None and gyro is None:
         return None

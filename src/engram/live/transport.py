@@ -52,7 +52,7 @@ class Transport(Protocol):
     """Brings frames and commands to a live process, and takes its messages away."""
 
     def events(self) -> Iterator[FrameEvent | Command | None]:
-        """What arrived, in order, the newest frame only; None whenever nothing did for a while.
+        """Arrivals in order, of frames the newest only; None whenever nothing came for a while.
 
         Ends when nothing more can come.
         """

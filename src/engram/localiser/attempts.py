@@ -99,7 +99,7 @@ class Outcome:
 
     @property
     def position(self) -> Position:
-        """Where the robot is by this match, which must have a pose."""
+        """The robot's position by this match, which must have a pose."""
         pose, covariance = self.match.reference_from_live, self.match.covariance
         assert pose is not None
         assert covariance is not None

@@ -151,12 +151,12 @@ class Localiser:
 
     @property
     def position(self) -> Position | None:
-        """Where the robot is by its last match or saved node; None if unknown."""
+        """The robot's position by its last match or saved node; None if unknown."""
         return self._track.measured
 
     @property
     def best_position(self) -> Position | None:
-        """Where it is by the matches before that, too."""
+        """The same, fused with the matches before that."""
         return self._track.best
 
     @property

@@ -78,8 +78,8 @@ class LookalikeConfig:
         float,
         Meta(
             ge=0,
-            description="log-odds that it is not, from which a doubted run is accepted again, and "
-            "edges are created from a run",
+            description="log-odds that a run is not of look-alikes, from which a doubted one is "
+            "accepted again, and edges are created",
         ),
     ] = 0.08
     most: Annotated[
@@ -87,13 +87,13 @@ class LookalikeConfig:
     ] = 8.0
     apart_m: Annotated[
         float,
-        Meta(gt=0, description="m from which two matches of a run show other things"),
+        Meta(gt=0, description="distance from which two matches of a run are independent, m"),
     ] = 6.0
     again_m: Annotated[
-        float, Meta(ge=0, description="m after which an accepted run is judged again")
+        float, Meta(ge=0, description="distance after which an accepted run is judged again, m")
     ] = 2.0
     forgotten_after_m: Annotated[
-        float, Meta(gt=0, description="m without a match after which a run begins again")
+        float, Meta(gt=0, description="distance without a match after which a run begins again, m")
     ] = 30.0
 
     def __post_init__(self) -> None:
@@ -238,7 +238,7 @@ def _disparity_at(
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """What a match shows of whether it is a look-alike.
+    """Evidence of a match for or against being a look-alike.
 
     Attributes:
         share: natural logarithm of its inliers over the usual ones.

@@ -295,7 +295,7 @@ class MapReader:
         return self._read(reading.landmark_hashes)
 
     def known_among(self, some: Sequence[bytes]) -> frozenset[bytes]:
-        """Those of the UUIDs whose nodes are held or were omitted, and need not be handed in."""
+        """The UUIDs whose nodes are held or were omitted, and need not be handed in."""
         with self._database.reading() as connection:
             return reading.known_among(connection, self._view, some)
 

@@ -21,7 +21,7 @@ _NS_PER_S = 1e9
 
 @dataclass(frozen=True, slots=True)
 class Speed:
-    """What one visual step says of the speed.
+    """Evidence of one visual step about the speed.
 
     Attributes:
         stamp_ns: of the frame in which it ends.

@@ -51,14 +51,14 @@ class FixedConfig:
         int, Meta(ge=0, description="most different bits of a landmark that kept its pixel")
     ] = 45
     same_disparity_px: Annotated[
-        float, Meta(gt=0, description="and largest change of its disparity, px")
+        float, Meta(gt=0, description="largest change of disparity of such a landmark, px")
     ] = 1.0
     flow_px: Annotated[
         float,
         Meta(
             gt=1,
-            description="px by which the others' motion would have moved a landmark, at least, for "
-            "it to defy that motion by keeping its pixel",
+            description="least distance, px, by which the others' motion would have moved a "
+            "landmark that kept its pixel, for it to defy that motion",
         ),
     ] = 4.0
     defying: Annotated[
@@ -70,26 +70,26 @@ class FixedConfig:
     ] = 25
     others_share: Annotated[
         float,
-        Meta(gt=0, le=1, description="and their least share of all that kept no pixel"),
+        Meta(gt=0, le=1, description="their least share among all landmarks that moved"),
     ] = 0.12
     majority: Annotated[
         float,
         Meta(
             gt=1,
-            description="so many times as many landmarks move as defy, or the reverse: then those "
-            "are the world",
+            description="ratio of moving to defying landmarks, or the reverse, from which the "
+            "larger group is the world",
         ),
     ] = 2.0
     one_depth: Annotated[
         float,
-        Meta(gt=1, description="largest ratio of the depths of what lies all at one depth"),
+        Meta(gt=1, description="largest ratio of depths that count as one depth"),
     ] = 1.3
     near_keeps: Annotated[
         float,
         Meta(
             gt=0,
             le=1,
-            description="least share of the near landmarks that keep their pixels, where",
+            description="least share of near landmarks with kept pixels, to ride with the camera",
         ),
     ] = 0.5
     behind_keeps: Annotated[
@@ -97,18 +97,17 @@ class FixedConfig:
         Meta(
             ge=0,
             lt=1,
-            description="at most this share of those behind them does: then the near ones ride "
-            "along with the camera",
+            description="largest share of the landmarks behind them with kept pixels, for the same",
         ),
     ] = 0.1
     behind: Annotated[
-        float, Meta(gt=0, lt=1, description="and these are at least this share of all")
+        float, Meta(gt=0, lt=1, description="least share of landmarks behind them, for the same")
     ] = 0.25
     votes: Annotated[
         float, Meta(gt=0, description="votes after which a cell is fixed to the camera")
     ] = 2.5
     most_votes: Annotated[
-        float, Meta(gt=0, description="most votes of a cell, so that what has gone is forgotten")
+        float, Meta(gt=0, description="most votes of a cell, so that past things are forgotten")
     ] = 6.0
     weak_votes: Annotated[
         float, Meta(gt=0, description="votes after which a cell next to a fixed one is fixed, too")
@@ -118,15 +117,13 @@ class FixedConfig:
     ] = 0.03
     least_share: Annotated[
         float,
-        Meta(
-            gt=0, lt=1, description="least share of the image that is learnt; smaller does no harm"
-        ),
+        Meta(gt=0, lt=1, description="least share of the image that is learnt; less does no harm"),
     ] = 0.01
     every: Annotated[
         int, Meta(ge=1, description="frames from one look to the next while nothing is fixed")
     ] = 4
     first: Annotated[
-        int, Meta(ge=0, description="first frames of a drive, all of which are looked at")
+        int, Meta(ge=0, description="first frames of a drive, all of which are examined")
     ] = 12
 
     def __post_init__(self) -> None:
@@ -299,7 +296,7 @@ class FixedPixels:
             self._span = 1 if self._span >= _LONGEST_SPAN else 2 * self._span
 
     def _looked_at(self, reference: Frame, frame: Frame, outside: Guess | None) -> FixedLook:
-        """Who kept the pixel, how did the others move, and who of them is the world?"""
+        """Which landmarks kept their pixel, how the others moved, and which are the world."""
         kept, told = kept_rows(reference, frame, self._config), self._outside
         keeps = kept >= 0
         parted = None

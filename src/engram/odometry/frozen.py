@@ -56,7 +56,7 @@ class FrozenConfig:
         float,
         Meta(gt=0, description="distance by wheels, m, over which a still picture is old"),
     ] = 0.3
-    moved_rad: Annotated[float, Meta(gt=0, description="turn over which it is, rad")] = float(
+    moved_rad: Annotated[float, Meta(gt=0, description="turn over which it is old, rad")] = float(
         np.deg2rad(10.0)
     )
     still_share: Annotated[

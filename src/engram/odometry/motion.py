@@ -149,8 +149,8 @@ class GapConfig:
         float,
         Meta(
             ge=0,
-            description="m that weak steps which a strong one refutes may have been wrong in all, "
-            "before the position no longer follows from them",
+            description="greatest total error of weak steps refuted by a strong one, m; beyond it "
+            "the position no longer follows from them",
         ),
     ] = 1.0
     sure_start: Annotated[

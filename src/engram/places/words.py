@@ -34,7 +34,7 @@ def vocabulary_of(opened: Map) -> Vocabulary | None:
 
 
 def problems_of(path: Path, *, thin: bool = False) -> list[Problem]:
-    """What is wrong with a map file, its vocabulary included.
+    """Faults of a map file, its vocabulary included.
 
     Args:
         path: NAME.engram.
@@ -48,7 +48,7 @@ def problems_of(path: Path, *, thin: bool = False) -> list[Problem]:
 
 
 def vocabulary_problems(path: Path) -> list[Problem]:
-    """What is wrong with a map's vocabulary; nothing where the map itself cannot be opened."""
+    """Faults of a map's vocabulary; none where the map itself cannot be opened."""
     try:
         with Map.open(path) as store:
             body = store.vocabulary

@@ -82,27 +82,27 @@ class RepairConfig:
         ),
     ] = 3
     most_unseen: Annotated[
-        float, Meta(description="surety of such an edge with fewer of them, at most")
+        float, Meta(description="greatest surety of such an edge with fewer second looks")
     ] = 0.95
     contradicted_surety: Annotated[
         float,
-        Meta(description="surety that an edge is wrong which the rest of the map contradicts"),
+        Meta(description="surety that an edge contradicted by the rest of the map is wrong"),
     ] = 1.8
-    alone_surety: Annotated[
-        float, Meta(description="surety that an edge is wrong which nothing confirms")
-    ] = 0.85
+    alone_surety: Annotated[float, Meta(description="surety that an unconfirmed edge is wrong")] = (
+        0.85
+    )
     tie_surety: Annotated[
         float,
-        Meta(description="surety less for a tie: a robot that was localised made it, and drove on"),
+        Meta(description="surety subtracted for a tie: a localised robot made it, and drove on"),
     ] = 0.5
     doubtful: Annotated[
         float, Meta(description="surety from which an edge is listed as doubtful")
     ] = 0.7
     per_failing_look: Annotated[
-        float, Meta(ge=0, description="surety that a second look adds which does not agree")
+        float, Meta(ge=0, description="surety that each disagreeing second look adds")
     ] = 0.1
     most_by_looks: Annotated[
-        float, Meta(ge=0, description="surety that such looks add together, at most")
+        float, Meta(ge=0, description="greatest surety that such looks add together")
     ] = 0.8
     per_look: Annotated[
         float, Meta(ge=0, description="surety that each agreeing second look subtracts")

@@ -91,7 +91,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Findings:
-    """What a search came to.
+    """Result of a search.
 
     Attributes:
         wrong: edges to remove, the surest first.
@@ -179,7 +179,7 @@ class _Search:
         return found
 
     def report(self, found: Sequence[Finding]) -> Findings:
-        """What the rounds came to; `found` is of this, the last one."""
+        """Result of the rounds; `found` is of this, the last one."""
         wrong = [*self._gone.values(), *(one for one in found if one.surety >= 1)]
         wrong += self._derived(wrong)
         doubtful = [one for one in found if self._config.doubtful <= one.surety < 1]

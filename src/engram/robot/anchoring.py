@@ -34,7 +34,7 @@ _OUTLIER_SIGMAS = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnchorReport:
-    """What anchoring came to.
+    """Result of anchoring.
 
     Attributes:
         revision: its number; None for a preview.

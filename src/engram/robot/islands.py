@@ -211,7 +211,7 @@ class _Islands:
         return Edge(*ids, EdgeKind.MATCH, pose, covariance) if sure else None
 
     def _confirmed(self, edges: list[Edge]) -> list[Edge]:
-        """Those of the largest group that confirm each other, one of each place."""
+        """The largest group of matches that confirm each other, one of each place."""
         config, graph = self._config, self._graph
         best: list[Edge] = []
         judged = _evenly(edges, _JUDGED)
@@ -230,7 +230,7 @@ class _Islands:
 
 
 def _evenly(items: list[T], most: int) -> list[T]:
-    """So many of a list, spread over it: what one place hides another may show."""
+    """A given number of items, spread over a list: what one place hides another may show."""
     if len(items) <= most:
         return items
     return [items[at] for at in np.linspace(0, len(items) - 1, most).astype(np.int64).tolist()]

@@ -97,7 +97,7 @@ class Owner:
 
 
 class Into(Protocol):
-    """Where a live drive is kept."""
+    """Where the nodes of a live drive are saved."""
 
     @property
     def localiser(self) -> Localiser:

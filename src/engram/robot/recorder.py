@@ -39,13 +39,13 @@ _LOST = {LocalisationStatus.LOST, LocalisationStatus.NO_ODOMETRY}
 class RecorderConfig:
     """Settings of `Recorder`."""
 
-    seconds: Annotated[float, Meta(gt=0, description="s; how far back a record reaches")] = 30.0
+    seconds: Annotated[float, Meta(gt=0, description="length of a record, s")] = 30.0
     most_bytes: Annotated[
-        int, Meta(ge=1_000_000, description="bytes; most memory of images and landmarks kept")
+        int, Meta(ge=1_000_000, description="most memory for images and landmarks, bytes")
     ] = 64_000_000
-    jpeg_quality: Annotated[int, Meta(ge=1, le=100, description="of the images")] = 85
+    jpeg_quality: Annotated[int, Meta(ge=1, le=100, description="JPEG quality of the images")] = 85
     most_records: Annotated[
-        int, Meta(ge=1, description="records that one robot writes unasked; then it is silent")
+        int, Meta(ge=1, description="most records that one robot writes by itself")
     ] = 20
 
     def __post_init__(self) -> None:

@@ -123,7 +123,7 @@ class ImageSequence:
 
     @property
     def stamp_facts(self) -> list[str]:
-        """What is wrong with the stamps of images and motion, for people; empty for sound ones."""
+        """Faults of the stamps of images and motion, for people; empty for sound ones."""
         return [*self.stamps.texts("pair"), *stamp_facts_of_files(self._options.motion)]
 
     def __len__(self) -> int:

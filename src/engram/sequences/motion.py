@@ -172,7 +172,7 @@ def motion_of_files(
 
 
 def stamp_facts_of_files(names: tuple[str, ...]) -> list[str]:
-    """What is wrong with the stamps of files of motion, for people; empty for sound ones."""
+    """Faults of the stamps of files of motion, for people; empty for sound ones."""
     reports = ((name, timed_samples(Path(name))[1]) for name in names if Path(name).is_file())
     return [fact for name, report in reports for fact in report.texts(f"sample of {name}")]
 

@@ -300,7 +300,7 @@ def recognise(path: Path) -> str:
 
 
 def _asked_of(path: Path) -> str | None:
-    """What is to be done with a video, or with a folder of images; None for anything else."""
+    """Advice for a video, or for a folder of images; None for anything else."""
     folder, suffix = quote(str(path.with_suffix(""))), path.suffix.lower()
     if path.is_file() and suffix in _RECORDINGS:
         return f"{path}: is a recording of {_RECORDINGS[suffix]}"

@@ -155,7 +155,7 @@ def known_stamp(stamp_ns: int | None) -> int:
 
 
 def finite(fields: Sequence[str], count: int) -> list[float]:
-    """So many finite numbers of a row; see `read_rows`."""
+    """A given number of finite numbers of a row; see `read_rows`."""
     values = [float(field) for field in fields]
     if len(values) != count or not np.isfinite(values).all():
         raise ValueError(f"must have {count} finite numbers for the pose, has {len(values)}")

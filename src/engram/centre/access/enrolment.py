@@ -104,7 +104,7 @@ def _add_robot(
 
 
 def new_nonce(centre: Centre, robot: str) -> str:
-    """What a robot must sign to get a token; the same answer whether or not it is known."""
+    """A nonce that a robot must sign to get a token; given to unknown robots, too."""
     nonce, now = secrets.token_hex(16), centre.now_ns()
     with centre.database.writing(durable=False) as connection:
         connection.execute(delete(nonces).where(nonces.c.expires_ns < now))
@@ -170,7 +170,7 @@ def add_person(centre: Centre, name: str, map_name: str, role: Role) -> str:
 
 
 def subject_of(centre: Centre, token: str) -> Subject:
-    """Who holds a token.
+    """The holder of a token.
 
     Raises:
         NotKnownError: the token is unknown, or has expired.

@@ -31,7 +31,7 @@ _INCLUDES: Mapping[Role, frozenset[Role]] = {
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """Who asks.
+    """The caller of a request.
 
     Attributes:
         id: of the robot or person.

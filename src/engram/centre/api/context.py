@@ -1,4 +1,4 @@
-"""What every route works with: the centre, who asks, and which roles a route takes."""
+"""What every route works with: the centre, the caller, and the roles that a route accepts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _centre(request: Request) -> Centre:
 
 
 def who_asks(request: Request) -> Subject:
-    """Who holds the token of a request.
+    """The caller of a request, by its token.
 
     Raises:
         NotKnownError: the request is not authenticated.

@@ -67,7 +67,7 @@ class Page(BaseModel):
 
 
 class RefMove(Body):
-    """Where a ref is to stand."""
+    """The new target of a ref."""
 
     revision: Annotated[int, Field(ge=1, le=2**53, examples=[7])]
 
@@ -153,7 +153,8 @@ class HandIn(BaseModel):
     begun_ns: int
     ended_ns: int | None
     wanted: Annotated[
-        list[str], Field(description="the next parts to send, while it is open", examples=[[_HASH]])
+        list[str],
+        Field(description="the next parts to send, while the hand-in is open", examples=[[_HASH]]),
     ] = []
 
 
@@ -166,14 +167,16 @@ class Dream(BaseModel):
     asked_by: str
     asked_ns: int
     ended_ns: int | None
-    revision: Annotated[int | None, Field(description="that it made, if it found better")]
+    revision: Annotated[
+        int | None, Field(description="revision that the dream made, if it found a better map")
+    ]
     progress: str
     report: dict[str, Any] | None
     error: str | None
 
 
 class RobotReport(Body):
-    """What a robot runs, and what that came to."""
+    """What a robot runs, and with which result."""
 
     runs: Annotated[str | None, Field(max_length=60, examples=["7-18a3f0c2"])] = None
     content_hash: Annotated[str | None, Field(max_length=32, examples=[_ID])] = None
@@ -184,12 +187,12 @@ class RobotReport(Body):
 
 
 class Wanted(BaseModel):
-    """What a robot is to run, and which of its hand-ins it may forget."""
+    """Which version a robot is to run, and which of its hand-ins it may drop."""
 
     follows: Annotated[str, Field(examples=["stable"])]
     revision: Annotated[int, Field(examples=[7])]
     version: Annotated[
-        str, Field(description="of the revision, never given twice", examples=["7-18a3f0c2"])
+        str, Field(description="version of the revision, never reused", examples=["7-18a3f0c2"])
     ]
     durable_revision: Annotated[int, Field(examples=[5])]
 
@@ -219,7 +222,7 @@ class Open(BaseModel):
 
 
 class Me(BaseModel):
-    """Who the token is for."""
+    """The holder of the token."""
 
     id: Annotated[str, Field(examples=[_ID])]
     name: Annotated[str, Field(examples=["alice"])]
@@ -227,7 +230,7 @@ class Me(BaseModel):
 
 
 class MapListed(BaseModel):
-    """A map of the one who asks."""
+    """A map that the caller may read."""
 
     name: Annotated[str, Field(examples=["fleet"])]
     durable_revision: Annotated[int, Field(examples=[5])]

@@ -38,7 +38,7 @@ def ask_token(body: models.TokenRequest, centre: CentreHere) -> dict[str, Any]:
 
 @router.get("/me", response_model=models.Me)
 def who_am_i(who: Asking) -> dict[str, Any]:
-    """Who the token is for."""
+    """The holder of the token."""
     return {"id": who.id, "name": who.name, "roles": dict(who.roles)}
 
 

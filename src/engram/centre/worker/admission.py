@@ -89,7 +89,7 @@ def _admit(pipe: Connection, limits: tuple[int, int, int]) -> None:
 
 
 def write_checked(manifest: Manifest, parts: dict[PartHash, bytes], path: Path) -> None:
-    """What the process does: joins the parts, and verifies every record.
+    """Main function of the process: joins the parts, and verifies every record.
 
     Raises:
         MapCorruptError: the parts make no sound map.

@@ -86,7 +86,7 @@ def find_best_order(
 
 
 def results_in(folder: Path) -> list[OrderResult]:
-    """What earlier searches in a folder found, best first; all must be of the same inputs."""
+    """Results of earlier searches in a folder, best first; all must have the same inputs."""
     found = []
     for path in sorted(folder.glob("order-*.json")):
         try:

@@ -24,7 +24,7 @@ Kept = TypeVar("Kept")
 
 @dataclass(frozen=True, slots=True)
 class BuildPlan:
-    """All that a build depends on up to its merges; equal plans give equal maps of the groups.
+    """Inputs of a build up to its merges; equal plans give equal maps of the groups.
 
     Attributes:
         groups: sessions of each group, in the order of mapping.

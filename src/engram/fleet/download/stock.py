@@ -164,6 +164,6 @@ class Stock:
 
 
 def _zones_told(sessions: Sequence[Session]) -> str:
-    """What keeps the hours of these sessions unknown though they have zones."""
+    """Why the hours of these sessions are unknown although they have zones."""
     notes = {note: None for one in sessions if (note := zone_note(one))}
     return "".join(f"{note}; " for note in notes)

@@ -36,7 +36,7 @@ from engram.monitor import QUIET, Monitor
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UpdateReport:
-    """What a robot's map gained.
+    """What an update added to a robot's map.
 
     Attributes:
         out: the robot's map.

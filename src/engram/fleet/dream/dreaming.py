@@ -207,7 +207,7 @@ def _check(centre: Path, handed: Sequence[Path], drives: Sequence[Path]) -> None
 
 @dataclass(frozen=True, slots=True)
 class _Dream:
-    """What is dreamt of; see `dream`, and `find_best_order` for `judge`."""
+    """Inputs of a dream; see `dream`, and `find_best_order` for `judge`."""
 
     centre: Path
     handed: Sequence[Path]
@@ -216,7 +216,7 @@ class _Dream:
     options: DreamOptions
 
     def folder(self) -> Path:
-        """Where results of exactly these inputs are kept."""
+        """Folder of the results of exactly these inputs."""
         hashes = []
         for path in self.handed:
             with Map.open(path) as store:

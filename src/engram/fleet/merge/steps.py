@@ -36,7 +36,7 @@ from engram.robot.localisers import drives_of
 
 @dataclass(frozen=True, slots=True)
 class Gates:
-    """What a merge has to pass.
+    """The gates of a merge.
 
     Attributes:
         held_out: held-out drives must not localise worse; None for no such check.

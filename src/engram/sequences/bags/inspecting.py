@@ -154,7 +154,7 @@ def _topics(bag: Bag) -> tuple[list[TopicFacts], int, int]:
 
 
 def _stamps(bag: Bag, drive: BagSequence | None) -> tuple[list[str], float]:
-    """What is wrong with stamps, for people, and the share of images that are left out for it."""
+    """Faults of stamps, for people, and the share of images left out because of them."""
     facts, share = [], 0.0
     if drive is not None:
         share = drive.read_stamps().faulty_share

@@ -201,7 +201,7 @@ def _content(file: BinaryIO, head: bytes) -> bytes:
 
 
 def _content_or_part(file: BinaryIO, head: bytes) -> tuple[bytes, bool]:
-    """What is there of the content, and whether that is all of it."""
+    """The readable part of the content, and whether that is all of it."""
     if len(head) < 9:
         raise DamageError("the file is cut short")
     (size,) = struct.unpack_from("<Q", head, 1)

@@ -168,7 +168,7 @@ class BagSequence:
 
     @property
     def stamp_facts(self) -> list[str]:
-        """What was wrong with the stamps of images, motion and fixes, for people."""
+        """Faults of the stamps of images, motion and fixes, for people."""
         left, right = (clock.report for clock in self.pairing.clocks)
         reports = {"left image": left}
         if right != left:
@@ -186,12 +186,12 @@ class BagSequence:
 
     @property
     def lost(self) -> list[str]:
-        """What of the bag could not be read, in all passes; empty for a sound one."""
+        """The unreadable parts of the bag, in all passes; empty for a sound one."""
         return [*self._bag.lost, *self.skipped_reasons]
 
     @property
     def notes(self) -> list[str]:
-        """What of calibration and mounting was read otherwise than it is written."""
+        """The entries of calibration and mounting that were not read as they are written."""
         notes, frame = list(self.cameras.notes), self.frame
         base, moving = self.transforms.base_of(frame), self.transforms.turning(frame)
         if self.camera.cam_from_rig is None and moving is not None:
