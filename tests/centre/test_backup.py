@@ -37,7 +37,7 @@ def test_a_map_whose_file_is_gone_is_not_made_anew(site):
     site.centre.close()
     path = site.centre.map_path(NAME)
     path.unlink()
-    with pytest.raises(InputError, match=r"fleet\.engram is missing, .*: put it back"):
+    with pytest.raises(InputError, match=r"fleet\.engram is missing, .*restore it"):
         site.centre.add_map(NAME, "tests")
     assert not path.exists()
     health = site.http.get(f"/maps/{NAME}/health", headers=site.token("viewer"))
