@@ -171,7 +171,7 @@ def describe_teblid(
     RA-L 2021.
 
     Raises:
-        MissingExtraError: OpenCV lacks its contrib modules.
+        MissingExtraError: OpenCV is installed without its contrib modules.
     """
     import cv2
 
