@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.opencv import needs_contrib
 
 from engram_lab.fits import calibration
 from engram_lab.fits.calibration import (
@@ -25,6 +26,7 @@ def seen() -> Appearance:
 
 
 @pytest.mark.long
+@needs_contrib
 def test_light_costs_inliers_as_it_was_calibrated_to(seen: Appearance) -> None:
     means = {name: counts.mean() for name, counts in seen.inliers.items()}
     # Five places scatter by a fifth around the table of all; a knob that is turned shows.
@@ -36,6 +38,7 @@ def test_light_costs_inliers_as_it_was_calibrated_to(seen: Appearance) -> None:
 
 
 @pytest.mark.long
+@needs_contrib
 def test_a_visit_matches_itself_at_every_place() -> None:
     places = Places(1, every_m=75.0)
     frames = reference_frames(places, VISITS["morning"])
