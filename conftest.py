@@ -14,7 +14,9 @@ import cv2
 import hypothesis
 import pytest
 
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 from engram_lab.bench.data import synthetic_drive
 
 # A busy machine is no failure: no test has a time limit.

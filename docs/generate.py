@@ -9,10 +9,10 @@ from typing import Any
 import typer
 
 import engram
-from engram.cli.app import app
+from engram.cli.app import GROUPS, NESTED, app
 from engram.cli.settings import AllSettings, every_setting
-from engram.cli.verbs import GROUPS, NESTED
-from engram.doctor import CHECKS, DoctorConfig
+from engram.doctor.examination import DoctorConfig
+from engram.doctor.table import CHECKS
 from engram.maps.schema import metadata
 
 

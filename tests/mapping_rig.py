@@ -10,14 +10,17 @@ from pathlib import Path
 import numpy as np
 from tests.synthetic_world import Seen
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.model import Clock, NodeId, Session, session_id
-from engram.localiser import Budget, Localisation, Localiser
-from engram.mapper import Mapper, NodeSaver, Saver
-from engram.maps import Map, open_map
-from engram.robot import Front, Robot, Settings
+from engram.localiser.localisation import Budget, Localisation
+from engram.localiser.localiser import Localiser
+from engram.mapper.mapper import Mapper, NodeSaver, Saver
+from engram.maps.map import Map, open_map
+from engram.robot.front import Front
+from engram.robot.live import loop_search
 from engram.robot.localisers import localiser_in
-from engram.robot.saving import loop_search
+from engram.robot.robot import Robot
+from engram.robot.settings import Settings
 
 
 @dataclass

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from engram.frontend import BRIEF, Frame, FrameStatus, Landmarks
-from engram.geometry import SE3, StereoCamera
+from engram.frontend.frame import BRIEF, Frame, FrameStatus, Landmarks
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 
 CAMERA = StereoCamera(fx=300.0, fy=300.0, cx=255.0, cy=190.0, baseline_m=0.3, width=512, height=384)
 

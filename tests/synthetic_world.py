@@ -11,11 +11,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from engram.frontend import BRIEF, Frame, FrameStatus
-from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
-from engram.geometry import SE3, StereoCamera
-from engram.odometry import OdometryStatus, OdometryStep
-from engram.sequences import LoggedFrame
+from engram.frontend.blobs import landmarks_from_codes, pixel_quantum, quantise
+from engram.frontend.frame import BRIEF, Frame, FrameStatus
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.sequences.sequence import LoggedFrame
 
 CAMERA = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.3, 640, 480)
 PERIOD_NS = 50_000_000

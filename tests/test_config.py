@@ -11,9 +11,8 @@ from msgspec import Meta
 from engram.cli.settings import AllSettings, read_settings, settings_toml
 from engram.config import check_bounds, config_hash, from_dict, load_toml, plain, to_dict
 from engram.errors import ConfigError
-from engram.mapper import MapperConfig
-from engram.robot import Settings, load_settings
-from engram.robot.settings import VERB_TABLES
+from engram.mapper.mapper import MapperConfig
+from engram.robot.settings import VERB_TABLES, Settings, load_settings
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from engram.counts import counted
-from engram.fleet.merge import MergeReport
+from engram.fleet.merge.report import MergeReport
 from engram.maps.history import log_text
 
 

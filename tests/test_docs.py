@@ -25,8 +25,8 @@ import yaml
 import engram
 from engram import errors
 from engram.cli.app import app, main
-from engram.sample import write_drives
-from engram.sequences import SEQUENCES
+from engram.sample.drives import write_drives
+from engram.sequences.opening import SEQUENCES
 from engram_lab.bench.data import synthetic_drive
 
 ROOT = Path(__file__).parent.parent

@@ -79,7 +79,7 @@ def run_shown(words: list[str]) -> None:
             assert (ROOT / folder / "pyproject.toml").exists(), folder
         case ["engram", "lab", "evaluate", "ranking", *_]:  # minutes; its policies are installed
             names = words[words.index("--policies") + 1]
-            from engram.ranking import policy_names
+            from engram.ranking.policies import policy_names
 
             assert {*names.split(",")} <= {*policy_names()}
         case _:

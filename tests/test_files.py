@@ -12,7 +12,7 @@ import pytest
 
 from engram.errors import InputError, MapError
 from engram.files import WriterLock, current_holder, draft_folder, remove_left_drafts
-from engram.maps import Map
+from engram.maps.map import Map
 
 _WRITES_ON = """
 import sys

@@ -11,8 +11,8 @@ from tests.synthetic_world import CAMERA
 import engram
 from engram.cli.options import Drive, Effort
 from engram.keywords import keywords
-from engram.maps import Map
-from engram.robot import RobotOptions
+from engram.maps.map import Map
+from engram.robot.settings import RobotOptions
 
 PUBLIC = {
     "open_drive": engram.open_drive,

@@ -19,24 +19,23 @@ from tests.worlds import covariance_of, forward, make_edge
 from engram.cli.fleet import _judge, merging_of
 from engram.cli.options import Effort
 from engram.cli.settings import every_setting, read_settings
-from engram.fleet.merge import MergeOptions, Reason
-from engram.fleet.merge.whole_segments import SeedFrom, Unit
-from engram.geometry import SE3
-from engram.graph.breadth_first import breadth_first
+from engram.fleet.merge.report import Reason
+from engram.fleet.merge.settings import MergeOptions, SeedFrom, Unit
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, path_id
 from engram.graph.neighbourhood import Search
 from engram.graph.paths import MATCHES_ONLY, PathMemory
-from engram.localiser import Budget, LocaliserConfig, Position
+from engram.graph.proximity import breadth_first
 from engram.localiser.acceptance import Rule
-from engram.localiser.settings import NeighbourhoodSearch, PathEntries, Success
-from engram.maps import Map
+from engram.localiser.localisation import Budget, Position
+from engram.localiser.settings import LocaliserConfig, NeighbourhoodSearch, PathEntries, Success
+from engram.maps.map import Map
 from engram.measures import Drive, failure
-from engram.ranking import POLICIES
-from engram.robot import Settings, load_settings
+from engram.ranking.policies import POLICIES
 from engram.robot.localisers import localiser_in
-from engram.robot.settings import PAPERS
-from engram.testing.situations import make_node
+from engram.robot.settings import PAPERS, Settings, load_settings
+from engram.testing.contracts import make_node
 
 PAGE = Path(__file__).parents[1] / "docs" / "papers.md"
 WORLD = World(30.0)

@@ -11,12 +11,12 @@ import typer
 from typer.testing import CliRunner
 
 from engram import plugins
-from engram.cli import verbs
+from engram.cli import app as verbs
 from engram.cli.app import app
 from engram.errors import IncompatibleError
 from engram.frontend.features import feature_kind
-from engram.ranking import policy_named, policy_names
-from engram.sequences import layout_named, layout_names, open_drive
+from engram.ranking.policies import policy_named, policy_names
+from engram.sequences.opening import layout_named, layout_names, open_drive
 
 
 class NoRank:

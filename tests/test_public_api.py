@@ -4,14 +4,12 @@ import subprocess
 import sys
 
 import engram
-import engram.robot
 
 
 def test_every_public_name_is_there() -> None:
     for name in engram.__all__:
         assert getattr(engram, name) is not None
     assert set(engram._HOMES) == set(engram.__all__) - {"__version__"}
-    assert set(engram.robot._HOMES) == set(engram.robot.__all__)
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
@@ -20,7 +18,7 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
 
 def test_importing_engram_and_its_program_imports_nothing_heavy() -> None:
     code = (
-        "import sys, engram, engram.cli.verbs\n"
+        "import sys, engram, engram.cli.app\n"
         "heavy = {'numpy', 'cv2', 'scipy', 'sqlalchemy', 'matplotlib', 'rich'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )

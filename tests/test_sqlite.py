@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.maps.maps import begin, session, write_drive
 
-from engram.maps import Map
+from engram.maps.map import Map
 
 ROOT = Path(__file__).parents[1]
 # A pipe, a device and a folder, by every way in; in a process of its own, for it might wait.
@@ -16,8 +16,10 @@ OPENS = """
 import os, sys
 from pathlib import Path
 from engram.errors import EngramError
-from engram.maps import Map, check_file
-from engram.sequences.framelog import FrameLog, FrameLogWriter
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.framelog.writer import FrameLogWriter
 from tests.sequences.test_framelog import log_header
 
 folder = Path(sys.argv[1])
@@ -66,7 +68,7 @@ def test_only_regular_files_are_opened_and_nobody_waits(tmp_path: Path) -> None:
 def test_who_reads_the_map_that_it_writes_keeps_its_locks(tmp_path: Path) -> None:
     """Otherwise the next process to leave the map takes its log along, and all that comes after."""
     path = tmp_path / "town.engram"
-    looks = "import sys; from engram.maps import Map as m; print(m.open(sys.argv[1]).revision)"
+    looks = "import sys; from engram.maps.map import Map as m; print(m.open(sys.argv[1]).revision)"
     with Map.create(path) as store:
         writer = begin(store, session())
         write_drive(writer)

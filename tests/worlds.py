@@ -2,15 +2,9 @@
 
 import numpy as np
 
-from engram.geometry import SE3
-from engram.graph.model import (
-    Attempt,
-    Edge,
-    EdgeKind,
-    NodeId,
-    SessionId,
-)
-from engram.maps import MapContents
+from engram.geometry.se3 import SE3
+from engram.graph.model import Attempt, Edge, EdgeKind, NodeId, SessionId
+from engram.maps.records import MapContents
 
 
 def covariance_of(sigma_m: float, sigma_rad: float) -> np.ndarray:

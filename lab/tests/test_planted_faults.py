@@ -11,19 +11,20 @@ from tests.fleet.robots import frame_log
 
 from engram.errors import InputError
 from engram.fleet.build.building import BuildReport
-from engram.fleet.build.group_mapping import GroupResult
-from engram.fleet.download import DownloadOptions
+from engram.fleet.build.scratch import GroupResult
+from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.merge.gate import what_is_worse
 from engram.graph.basin import BASIN_LEVEL, MatchBasin
 from engram.graph.model import SessionId, session_id
 from engram.measures import Drive
-from engram.ranking import POLICIES
-from engram.robot import RobotOptions, Settings, open_drive
-from engram.testing.situations import make_context
+from engram.ranking.policies import POLICIES
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
+from engram.testing.contracts import make_context
 from engram_lab import trial
 from engram_lab.checks.planted_faults import FAULTS, planted
 from engram_lab.studies.fleet.results import Parallel, Time
-from engram_lab.studies.fleet.trials import _united
+from engram_lab.studies.fleet.steps import _united
 
 ROOT = Path(__file__).parents[2]
 

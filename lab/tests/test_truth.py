@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from tests.sequences.synthetic import only_engram_errors, write_log
 
 from engram.errors import SequenceError
-from engram.geometry import SE3
-from engram.sequences import open_drive
-from engram.sequences.trajectories import Trajectory, write_tum
+from engram.geometry.se3 import SE3
+from engram.sequences.motion import Trajectory, write_tum
+from engram.sequences.opening import open_drive
 from engram_lab.truth import (
     read_euroc_truth,
     read_ins_truth,

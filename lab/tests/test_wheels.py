@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram_lab.wheels import SCALE, Wheels, measured
 
 FRAMES = 150

@@ -11,12 +11,16 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from engram.errors import EngramError
-    from engram.frontend import StereoPair
-    from engram.geometry import SE3, StereoCamera
-    from engram.localiser import Budget, Localisation, LocalisationStatus, Position
-    from engram.maps import Map, open_map
-    from engram.odometry import OutsideMotion
-    from engram.robot import Robot, Settings, map_drive, open_drive
+    from engram.frontend.frame import StereoPair
+    from engram.geometry.cameras import StereoCamera
+    from engram.geometry.se3 import SE3
+    from engram.localiser.localisation import Budget, Localisation, LocalisationStatus, Position
+    from engram.maps.map import Map, open_map
+    from engram.odometry.outside import OutsideMotion
+    from engram.robot.mapping import map_drive
+    from engram.robot.robot import Robot
+    from engram.robot.settings import Settings
+    from engram.sequences.opening import open_drive
 
 __version__ = "0.2.0a1"
 # Printed where somebody might rely on more: by `--version`, and beside a format that is refused.
@@ -42,21 +46,21 @@ __all__ = [
 ]
 
 _HOMES = {
-    "SE3": "engram.geometry",
-    "Budget": "engram.localiser",
+    "SE3": "engram.geometry.se3",
+    "Budget": "engram.localiser.localisation",
     "EngramError": "engram.errors",
-    "OutsideMotion": "engram.odometry",
-    "Robot": "engram.robot",
-    "Localisation": "engram.localiser",
-    "LocalisationStatus": "engram.localiser",
-    "Map": "engram.maps",
-    "Position": "engram.localiser",
-    "Settings": "engram.robot",
-    "StereoCamera": "engram.geometry",
-    "StereoPair": "engram.frontend",
-    "map_drive": "engram.robot",
-    "open_drive": "engram.robot",
-    "open_map": "engram.maps",
+    "OutsideMotion": "engram.odometry.outside",
+    "Robot": "engram.robot.robot",
+    "Localisation": "engram.localiser.localisation",
+    "LocalisationStatus": "engram.localiser.localisation",
+    "Map": "engram.maps.map",
+    "Position": "engram.localiser.localisation",
+    "Settings": "engram.robot.settings",
+    "StereoCamera": "engram.geometry.cameras",
+    "StereoPair": "engram.frontend.frame",
+    "map_drive": "engram.robot.mapping",
+    "open_drive": "engram.sequences.opening",
+    "open_map": "engram.maps.map",
 }
 
 

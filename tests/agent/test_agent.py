@@ -6,18 +6,17 @@ import httpx
 import pytest
 from tests.centre.conftest import Site, admit_here, drive
 
-from engram.agent import Agent, AgentSettings, enrol
-from engram.agent.link import CentreRefusedError, Unreachable
-from engram.agent.state import AgentState
-from engram.centre.backup import back_up
-from engram.centre.worker import merging
+from engram.agent.agent import Agent
+from engram.agent.link import CentreRefusedError, Unreachable, enrol
+from engram.agent.state import AgentSettings, AgentState
+from engram.centre import merging
+from engram.centre.serving import back_up
 from engram.cli.agent import _open, sync
-from engram.cli.endings import PartlyDoneError
+from engram.cli.options import PartlyDoneError
 from engram.config import load_toml
 from engram.errors import ConfigError, IncompatibleError, InputError, StorageFullError
-from engram.maps import Map
-from engram.transfers import Manifest, PartHash, part_hash
-from engram.transfers.manifest import encode_manifest
+from engram.maps.map import Map
+from engram.transfers import Manifest, PartHash, encode_manifest, part_hash
 
 
 @pytest.fixture
@@ -124,7 +123,7 @@ def test_a_folder_that_is_not_enrolled_is_named(tmp_path):
 
 
 def test_a_hand_in_of_more_parts_than_one_answer_names_is_sent_whole(site, monkeypatch):
-    monkeypatch.setattr("engram.centre.api.transfers._WANTED_AT_ONCE", 3)
+    monkeypatch.setattr("engram.centre.transfer_routes._WANTED_AT_ONCE", 3)
     agent = site.robot("r1")
     drive(agent.live, "r1", 1_000, 10)
     agent.hand_in()
@@ -135,7 +134,7 @@ def test_a_hand_in_of_more_parts_than_one_answer_names_is_sent_whole(site, monke
 
 
 def test_a_download_of_more_parts_than_one_request_names_is_fetched_whole(site, monkeypatch):
-    monkeypatch.setattr("engram.agent.fetching._ASKED_AT_ONCE", 3)
+    monkeypatch.setattr("engram.agent.outbox._ASKED_AT_ONCE", 3)
     first, second = site.robot("r1"), site.robot("r2")
     drive(first.live, "r1", 1_000, 10)
     first.hand_in()

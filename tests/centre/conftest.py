@@ -14,16 +14,16 @@ from fastapi.testclient import TestClient
 from sqlalchemy import create_engine, make_url, text
 from tests.maps.maps import begin, session, write_drive
 
-from engram.agent import Agent, enrol
-from engram.centre.access.enrolment import add_person, new_code
-from engram.centre.access.roles import Role
-from engram.centre.api.app import create_app
+from engram.agent.agent import Agent
+from engram.agent.link import enrol
+from engram.centre import merging
+from engram.centre.access import Role, add_person, new_code
+from engram.centre.app import create_app
+from engram.centre.merging import write_checked
 from engram.centre.service import Centre, MapPolicy
-from engram.centre.worker import merging
-from engram.centre.worker.admission import write_checked
-from engram.centre.worker.loop import work_off
-from engram.fleet.merge import MergeOptions
-from engram.maps import Map, open_map
+from engram.centre.worker import work_off
+from engram.fleet.merge.settings import MergeOptions
+from engram.maps.map import Map, open_map
 
 from .faults import FlakyClient
 

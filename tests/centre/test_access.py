@@ -13,17 +13,14 @@ import pytest
 import uvicorn
 from sqlalchemy import delete, insert
 
-from engram.agent import enrol
-from engram.agent.link import CentreRefusedError
+from engram.agent.link import CentreRefusedError, enrol
 from engram.centre import serving
-from engram.centre.access.enrolment import add_person, disable, new_code, take_away
-from engram.centre.access.roles import Role
-from engram.centre.dreams import Dreams
+from engram.centre.access import Role, add_person, disable, new_code, take_away
+from engram.centre.database import _hash, audit, first_broken
 from engram.centre.errors import UnknownError
 from engram.centre.fleet import Fleet
+from engram.centre.jobs import Dreams
 from engram.centre.serving import Listening, serve
-from engram.centre.store.audit import _hash, first_broken
-from engram.centre.store.schema import audit
 from engram.errors import ConfigError, InputError
 
 from .conftest import NAME, POLICY, drive
@@ -101,7 +98,7 @@ BODIES = {
 @pytest.fixture(scope="module")
 def used(tmp_path_factory):
     """A centre with a map that was handed in and asked for, and everybody's tokens."""
-    from engram.centre.worker import merging
+    from engram.centre import merging
 
     from .conftest import Site, admit_here
 
@@ -116,7 +113,7 @@ def used(tmp_path_factory):
     with site.centre.database.writing() as connection:
         from sqlalchemy import update
 
-        from engram.centre.store.schema import grants
+        from engram.centre.database import grants
 
         connection.execute(
             update(grants)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import pytest
 from sqlalchemy import update
 
-from engram.centre import backup
-from engram.centre.backup import back_up
-from engram.centre.refs import Refs
+from engram.centre import serving
+from engram.centre.database import handins, maps
+from engram.centre.fleet import Refs
 from engram.centre.service import Centre
-from engram.centre.store.schema import handins, maps
+from engram.centre.serving import back_up
 from engram.errors import InputError, StorageFullError
-from engram.maps import Map, copy_map
+from engram.maps.map import Map
+from engram.maps.map_files import copy_map
 
 from .conftest import NAME, drive
 
@@ -90,7 +91,7 @@ def test_a_backup_that_does_not_fit_leaves_nothing_and_robots_forget_nothing(
         raise StorageFullError("no space is left")
 
     with monkeypatch.context() as patch:
-        patch.setattr(backup, "copy_map", full)
+        patch.setattr(serving, "copy_map", full)
         with pytest.raises(StorageFullError):
             back_up(site.centre, tmp_path / "held" / "backup")
     assert list((tmp_path / "held").iterdir()) == []

@@ -8,10 +8,9 @@ import threading
 import pytest
 import uvicorn
 
-from engram.centre.api.app import create_app
-from engram.centre.fleet import Fleet
-from engram.centre.refs import Refs
-from engram.maps import Map
+from engram.centre.app import create_app
+from engram.centre.fleet import Fleet, Refs
+from engram.maps.map import Map
 
 from .conftest import NAME, drive
 

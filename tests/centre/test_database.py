@@ -9,8 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from sqlalchemy import select
 
-from engram.centre.store.database import ServiceDatabase
-from engram.centre.store.schema import usage
+from engram.centre.database import ServiceDatabase, usage
 from engram.errors import MapError
 
 THREADS = 8

@@ -17,16 +17,17 @@ from sqlalchemy import inspect, text
 from tests.fleet.test_dreaming import ASKED as USUAL
 from tests.fleet.test_dreaming import nodes_of, town
 
-from engram.centre.dreams import Dreams
+from engram.centre import merging, worker
+from engram.centre.database import dreams
 from engram.centre.errors import ConflictError
 from engram.centre.handins import HandIns
+from engram.centre.jobs import Dreams
 from engram.centre.service import Centre, MapPolicy
-from engram.centre.store.schema import dreams
-from engram.centre.worker import dreaming, merging
-from engram.centre.worker.dreaming import dream_a_while
+from engram.centre.worker import dream_a_while
 from engram.errors import WorkerError
 from engram.fleet.dream import DreamReport
-from engram.maps import Map, check_file, copy_map
+from engram.maps.map import Map
+from engram.maps.map_files import check_file, copy_map
 
 from .conftest import NAME, POLICY, Site, admit_here, drive
 from .faults import dying
@@ -151,9 +152,9 @@ class DreamMachine(RuleBasedStateMachine):
         self.folder = Path(tempfile.mkdtemp())
         self.patch = pytest.MonkeyPatch()
         self.patch.setattr(merging, "admit", admit_here)
-        self.patch.setattr(dreaming, "admit", admit_here)
-        self.patch.setattr(dreaming, "dream", self.dreamt)
-        self.patch.setattr(dreaming, "_dream_beside", self.beside)
+        self.patch.setattr(worker, "admit", admit_here)
+        self.patch.setattr(worker, "dream", self.dreamt)
+        self.patch.setattr(worker, "_dream_beside", self.beside)
         self.site = Site(self.folder)
         self.whole: list[tuple[str, ...]] = []
         self.ended: set[str] = set()
@@ -164,7 +165,7 @@ class DreamMachine(RuleBasedStateMachine):
 
     def beside(self, centre, row, wait, stopped, scheduler) -> None:
         assert not any(map(HandIns(centre).waiting, centre.map_names()))
-        dreaming.dream_of(centre, row)
+        worker.dream_of(centre, row)
 
     def dreamt(self, path, handed, *_) -> DreamReport:
         """As the fleet's dream: it reads what was handed in."""
@@ -278,7 +279,7 @@ def test_a_better_order_becomes_a_revision_and_a_hand_in_interrupts(tmp_path, to
     row = jobs.ask(NAME, "tests")
     asked = iter([False, True])
     with monkeypatch.context() as patch:
-        patch.setattr(dreaming, "_is_asked_for", lambda _: next(asked))
+        patch.setattr(worker, "_is_asked_for", lambda _: next(asked))
         assert dream_a_while(site.centre, time.sleep, lambda: False)
     assert jobs.get(row["id"])["state"] == "asked"
     assert nodes_of(site.centre.map_path(NAME)) == before
@@ -302,7 +303,7 @@ def test_a_dream_whose_process_dies_is_told_to_have_failed(site, in_process, mon
     handed_in(site, "r1", 1_000)
     judged(site)
     row = Dreams(site.centre).ask(NAME, "tests")
-    monkeypatch.setattr(dreaming, "_dream_here", dies)
+    monkeypatch.setattr(worker, "_dream_here", dies)
     assert dream_a_while(site.centre, time.sleep, lambda: False)
     assert "exit code 1" in Dreams(site.centre).get(row["id"])["error"]
 

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from engram.centre.access.roles import Role
-from engram.centre.api.app import create_app
-from engram.centre.dreams import Dreams
-from engram.maps import Map
+from engram.centre.access import Role
+from engram.centre.app import create_app
+from engram.centre.jobs import Dreams
+from engram.maps.map import Map
 
 from .conftest import NAME, POLICY, Site, admit_here, drive
 
@@ -28,7 +28,7 @@ TAKES_THE_ROBOT = "DELETE /v1/maps/{name}/robots/{robot}"  # that the others ask
 @pytest.fixture(scope="module")
 def used(tmp_path_factory):
     """A centre with a robot, a hand-in, a download and a dream; what places in paths can name."""
-    from engram.centre.worker import merging
+    from engram.centre import merging
 
     patch = pytest.MonkeyPatch()
     patch.setattr(merging, "admit", admit_here)

@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 from sqlalchemy import create_engine, text
 
-from engram.centre import downloads
+from engram.centre import jobs, merging, worker
+from engram.centre.database import _errors
 from engram.centre.handins import HandIns
+from engram.centre.merging import KilledError
 from engram.centre.service import Centre
-from engram.centre.store.database import _errors
-from engram.centre.worker import loop, merging
-from engram.centre.worker.admission import KilledError
 from engram.errors import EngramError, MapCorruptError, StorageFullError
 
 from .conftest import NAME, POLICY, drive
@@ -84,7 +83,7 @@ def test_a_download_is_made_when_there_is_room_again(site, monkeypatch):
     robot.hand_in()
     robot.step()
     with monkeypatch.context() as patch:
-        patch.setattr(downloads, "download", full)
+        patch.setattr(jobs, "download", full)
         with pytest.raises(StorageFullError):
             site.work()
     assert not HandIns(site.centre).waiting(NAME)  # a merge takes less room
@@ -111,7 +110,7 @@ def test_a_check_that_is_killed_is_made_again_but_not_for_ever(site, monkeypatch
 def test_two_workers_do_not_make_the_same_download(site, monkeypatch):
     handed(site)
     site.work()
-    robot, real, made = site.robot("r2"), downloads.download, []
+    robot, real, made = site.robot("r2"), jobs.download, []
     robot.step()
 
     def beside_another_worker(*given, **options):
@@ -119,7 +118,7 @@ def test_two_workers_do_not_make_the_same_download(site, monkeypatch):
         assert site.work() == 0
         return real(*given, **options)
 
-    monkeypatch.setattr(downloads, "download", beside_another_worker)
+    monkeypatch.setattr(jobs, "download", beside_another_worker)
     site.work()
     assert len(made) == 1
     site.settle()
@@ -135,9 +134,9 @@ def test_a_worker_goes_on_after_what_hindered_it_and_tells_it(site, monkeypatch,
         monkeypatch.undo()
 
     monkeypatch.setattr(merging, "admit", lambda *_: full())
-    monkeypatch.setattr(loop.work_off, "__defaults__", (merging.merge_hand_in,))
-    loop.work(site.centre, wait, lambda: len(waits) == 1)
-    assert waits == [loop._AGAIN_S]
+    monkeypatch.setattr(worker.work_off, "__defaults__", (merging.merge_hand_in,))
+    worker.work(site.centre, wait, lambda: len(waits) == 1)
+    assert waits == [worker._AGAIN_S]
     assert f"hand-in {row['id'][:8]} waits: no space is left; tried again in" in caplog.text
 
 

@@ -11,14 +11,14 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
-from engram.centre.backup import back_up
+from engram.centre import merging
 from engram.centre.handins import HandIns
-from engram.centre.keeping import HandInState
-from engram.centre.settings import CentreSettings
-from engram.centre.worker import merging
-from engram.centre.worker.sweeping import sweep
-from engram.fleet.merge import merge
-from engram.maps import Map, check_file
+from engram.centre.service import CentreSettings, HandInState
+from engram.centre.serving import back_up
+from engram.centre.worker import sweep
+from engram.fleet.merge.merging import merge
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 
 from .conftest import NAME, POLICY, Site, admit_here, drive
 from .faults import dying

@@ -9,12 +9,13 @@ import sys
 import msgspec
 import pytest
 
-from engram.centre import downloads
+from engram.centre import jobs
 from engram.centre.handins import HandIns
-from engram.centre.settings import CentreSettings
-from engram.centre.worker.admission import admit
+from engram.centre.merging import admit
+from engram.centre.service import CentreSettings
 from engram.errors import EngramError, MapCorruptError, MapLockedError
-from engram.maps import Map, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 from engram.transfers import Manifest, bundle, part_hash, split
 
 from .conftest import NAME, Site, drive
@@ -190,7 +191,7 @@ def test_admission_ends_at_its_limits(tmp_path, robot):
 def test_admission_runs_under_a_lower_limit_of_the_system():
     """With ``ulimit -f`` below its own it failed every hand-in, in words of time and memory."""
     code = (
-        "import resource as r; from engram.centre.worker.admission import confine; "
+        "import resource as r; from engram.centre.merging import confine; "
         "r.setrlimit(r.RLIMIT_FSIZE, (2**20, 2**20)); confine(2**33, 60, 2**26); "
         "print(r.getrlimit(r.RLIMIT_FSIZE), r.getrlimit(r.RLIMIT_CPU))"
     )
@@ -199,7 +200,7 @@ def test_admission_runs_under_a_lower_limit_of_the_system():
 
 
 def test_what_the_gate_refuses_stays_and_a_person_may_merge_it(site, robot, monkeypatch):
-    from engram.centre.worker import merging
+    from engram.centre import merging
     from engram.errors import RefusedError
 
     real = merging.merge
@@ -233,7 +234,7 @@ def test_an_error_names_no_place_on_the_centres_machine(site, robot, monkeypatch
     def locked(*_, **__):
         raise MapLockedError(f"{site.centre.map_path(NAME)} is locked")
 
-    monkeypatch.setattr(downloads, "download", locked)
+    monkeypatch.setattr(jobs, "download", locked)
     asked = {"options": {"thumbnails": False}}
     row = robot.link.ask("POST", f"/v1/maps/{NAME}/downloads", asked)
     site.work()

@@ -10,10 +10,10 @@ from contextlib import closing
 
 import pytest
 
+from engram.centre import merging
 from engram.centre.handins import HandIns
-from engram.centre.worker import apart, merging
-from engram.centre.worker.loop import work, work_off
-from engram.maps import Map
+from engram.centre.worker import work, work_off
+from engram.maps.map import Map
 from engram.maps.rows import sealed
 from engram.maps.schema import sessions
 
@@ -59,7 +59,7 @@ def end_by_exit(pipe, folder, addresses, settings, key) -> None:
 def test_what_kills_its_process_is_not_taken_again_without_an_operator(site, monkeypatch, end, how):
     killer = handed(site, "r1")
     with monkeypatch.context() as patch:
-        patch.setattr(apart, "_merge", end)
+        patch.setattr(merging, "_merge", end)
         assert work_off(site.centre) == 1
         state, error = state_of(site, killer)
         assert state == "failed"
@@ -108,7 +108,7 @@ def test_a_worker_goes_on_after_a_fault_that_nobody_foresaw(site, monkeypatch, w
         raise AssertionError(where)
 
     handed(site, "r1")
-    monkeypatch.setattr("engram.centre.worker.loop.work_off", raising)
+    monkeypatch.setattr("engram.centre.worker.work_off", raising)
     work(site.centre, waits.append, lambda: len(waits) == 2)
     assert waits == [10.0, 10.0]
 

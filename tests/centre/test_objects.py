@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from engram.centre.errors import StoreError
-from engram.centre.store.objects import BucketObjects, FolderObjects
+from engram.centre.objects import BucketObjects, FolderObjects
 from engram.errors import MapError
 
 

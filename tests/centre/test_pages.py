@@ -6,10 +6,9 @@ import re
 
 import pytest
 
-from engram.agent import enrol
-from engram.centre.access.enrolment import add_person, new_code
-from engram.centre.access.roles import Role
-from engram.centre.worker import merging
+from engram.agent.link import enrol
+from engram.centre import merging
+from engram.centre.access import Role, add_person, new_code
 
 from .conftest import KINDS, NAME, admit_here, drive, opened_site
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from engram.fleet.merge import merge
-from engram.maps import Map, check_file
+from engram.fleet.merge.merging import merge
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 
 from .conftest import NAME, POLICY, drive
 

@@ -8,10 +8,10 @@ from dataclasses import fields
 import pytest
 from sqlalchemy import update
 
+from engram.centre.database import maps
 from engram.centre.service import Centre, MapPolicy
-from engram.centre.store.schema import maps
 from engram.cli.settings import AllSettings
-from engram.fleet.merge import MergeOptions
+from engram.fleet.merge.settings import MergeOptions
 
 # The ranking stood under `policy`, and none was null.
 _OLD = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from engram.centre.errors import UnknownError
-from engram.centre.resident import log_of
+from engram.centre.service import log_of
 from engram.errors import EngramError
 
 from .conftest import NAME, drive

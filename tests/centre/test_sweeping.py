@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from engram.centre.settings import DAY_NS
-from engram.centre.store.packs import Packs
-from engram.centre.worker.sweeping import sweep
-from engram.transfers.pages import part_hash
+from engram.centre.objects import Packs
+from engram.centre.service import DAY_NS
+from engram.centre.worker import sweep
+from engram.transfers import part_hash
 
 from .conftest import NAME, drive
 

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from engram.cli.endings import ExitStatus
-from engram.maps import open_map
+from engram.cli.options import ExitStatus
+from engram.maps.map import open_map
 
 UNFIT, EXIT_DAMAGED = 4, 3
 NOT_TO_BE_TRUSTED = 5

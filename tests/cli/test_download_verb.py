@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 
 KEYS = {
     "out", "select", "revision", "source_hash", "content_hash", "nodes", "of_nodes", "sessions",

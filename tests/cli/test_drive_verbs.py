@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from tests.sequences.bag_maker import StereoBag, bag, rectified_infos
 
-from engram.calibration import read_calibration
+from engram.calibration.formats import read_calibration
 from engram.errors import NotAMapError
-from engram.geometry import StereoCamera
-from engram.maps import open_map
-from engram.sequences import open_drive
+from engram.geometry.cameras import StereoCamera
+from engram.maps.map import open_map
+from engram.sequences.opening import open_drive
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from engram.ranking import policy_names
+from engram.ranking.policies import policy_names
 
 
 @pytest.mark.parametrize("policy", sorted({*policy_names()} - {"oracle"}))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from engram.errors import MapCorruptError
-from engram.fleet.merge import MergeReport
+from engram.fleet.merge.report import MergeReport
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def failing(monkeypatch):
             monitor.hear(MergeReport(str(robots[0]), "", ["r1"], revision=2, changed=True, taken=3))
             raise error
 
-        monkeypatch.setattr("engram.fleet.merge.merge", merge)
+        monkeypatch.setattr("engram.fleet.merge.merging.merge", merge)
 
     return fail
 

@@ -12,9 +12,8 @@ import pytest
 import typer
 
 from engram import __version__
-from engram.cli.app import app
+from engram.cli.app import GROUPS, VERBS, app
 from engram.cli.settings import AllSettings, every_setting
-from engram.cli.verbs import GROUPS, VERBS
 
 COMMANDS = typer.main.get_command(app).commands
 # The longest help that a person takes in at once.

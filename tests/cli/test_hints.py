@@ -16,10 +16,9 @@ import pytest
 import typer
 
 from engram.cli import wording
-from engram.cli.app import app
+from engram.cli.app import LABORATORY, SPELLINGS, VERBS, app
 from engram.cli.options import Drive
 from engram.cli.settings import AllSettings, every_setting
-from engram.cli.verbs import LABORATORY, SPELLINGS, VERBS
 from engram.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -50,8 +49,8 @@ _SPOKEN_BY: dict[str, tuple[tuple[str, ...], ...]] = {
     "fleet/build": (("build",),),
     "fleet/download": (("download",),),
     "fleet/dream": (("dream",),),
-    "robot/anchoring.py": (("anchor",),),
-    "robot/exporting.py": (("export",),),
+    "robot/anchors.py": (("anchor",),),
+    "robot/inspecting.py": (("export",),),
 }
 # The doctor leaves bad pairs out by itself, and maps nothing.
 _SPARED = {("doctor", "--skip-bad")}
@@ -198,7 +197,7 @@ def test_what_the_laboratory_brings_is_named_as_its_own() -> None:
         for place, line, text in TEXTS
         for found in _VERB.finditer(text)
         if found[1] in LABORATORY and "engram-lab" not in text
-        if place != "cli/verbs.py"  # it asks whether the laboratory is installed
+        if place != "cli/app.py"  # it asks whether the laboratory is installed
     ]
     assert wrong == []
 

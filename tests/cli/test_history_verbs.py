@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from engram.maps import Map
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
+from engram.maps.map import Map
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 
 
 @pytest.fixture

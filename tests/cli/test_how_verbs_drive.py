@@ -8,21 +8,23 @@ from engram.errors import ConfigError
 
 # Verb, what it hands its robot's options to, and where they are in what it hands over.
 VERBS = {
-    "map": ("map m.engram DRIVE", "engram.robot.map_drive", lambda given, _: given[3]),
+    "map": ("map m.engram DRIVE", "engram.robot.mapping.map_drive", lambda given, _: given[3]),
     "localise": (
         "localise m.engram DRIVE", "engram.cli.localising.localise_and_print",
         lambda given, _: given[3],
     ),
     "live": (
-        "live m.engram --play DRIVE", "engram.live.LiveProcess", lambda given, _: given[1].robot,
+        "live m.engram --play DRIVE", "engram.live.process.LiveProcess",
+        lambda given, _: given[1].robot,
     ),
-    "view": ("view m.engram DRIVE", "engram.robot.robot_on", lambda given, _: given[3]),
+    "view": ("view m.engram DRIVE", "engram.robot.starting.robot_on", lambda given, _: given[3]),
     "merge": (
-        "merge c.engram m.engram", "engram.fleet.merge.merge",
+        "merge c.engram m.engram", "engram.fleet.merge.merging.merge",
         lambda _, named: named["localising"],
     ),
     "build": (
-        "build c.engram DRIVE --order best --validate DRIVE", "engram.fleet.build.build_map",
+        "build c.engram DRIVE --order best --validate DRIVE",
+        "engram.fleet.build.building.build_map",
         lambda given, _: given[3].judge.localising,
     ),
     "dream": (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 
-from engram.cli.progress import EVERY_S, Bars
+from engram.cli.screen import EVERY_S, Bars
 
 
 class Clock:

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from engram.cli import trying
-from engram.cli.endings import ExitStatus
-from engram.sample import DRIVES
+from engram.cli.options import ExitStatus
+from engram.sample.drives import DRIVES
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from tests.opencv import needs_contrib
 
-from engram.live import LiveProcess
-from engram.localiser import Localiser
+from engram.live.process import LiveProcess
+from engram.localiser.localiser import Localiser
 
 FRAME_KEYS = {
     "stamp_ns", "status", "node", "node_stamp_ns", "node_from_live", "inliers", "attempts",
@@ -250,7 +250,7 @@ def test_a_second_writer_is_told_who_writes(engram, street: Path, town: Path) ->
         [
             sys.executable,
             "-c",
-            "import sys; from engram.maps import Map\n"
+            "import sys; from engram.maps.map import Map\n"
             f"with Map.open({str(town)!r}, writes=True):\n"
             "    print('open', flush=True); sys.stdin.read()",
         ],

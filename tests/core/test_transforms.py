@@ -6,11 +6,11 @@ from scipy.linalg import expm
 from tests.instruction_sets import printed
 
 from engram import _core
-from engram.geometry import SE3, propagate_covariance, skew
+from engram.geometry.se3 import SE3, propagate_covariance, skew
 
 _PRINTS = """
 import numpy as np
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 rng = np.random.default_rng(5)
 for scale in (1e-9, 1e-3, 1.0):
     a, b = (SE3.exp(tangent) for tangent in scale * rng.normal(size=(2, 6)))

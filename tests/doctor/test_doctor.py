@@ -12,30 +12,19 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from engram.doctor import (
-    CHECKS,
-    Diagnosis,
-    DoctorConfig,
-    Evidence,
-    Examination,
-    Facts,
-    Severity,
-    diagnose,
-)
-from engram.doctor.checks.motion import scale_off, turn_ratio
-from engram.doctor.checks.sides import frames_late, upright
-from engram.doctor.examination import Look
-from engram.doctor.findings import Finding
-from engram.doctor.sides import align
-from engram.frontend import StereoPair
-from engram.frontend.sides import SideMatches, match_sides
-from engram.geometry import SE3, StereoCamera
+from engram.doctor.checks import frames_late, scale_off, turn_ratio, upright
+from engram.doctor.examination import DoctorConfig, Evidence, Examination, Facts, Look, align
+from engram.doctor.table import CHECKS, Diagnosis, Finding, Severity, diagnose
+from engram.frontend.features import SideMatches, match_sides
+from engram.frontend.frame import StereoPair
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 from engram.graph.model import Clock
-from engram.odometry import OutsideMotion
-from engram.robot import Front, Settings
-from engram.robot.examining import LookedAhead, stretches
-from engram.robot.front import stamp_of
-from engram.viewing.sides import side_picture
+from engram.odometry.outside import OutsideMotion
+from engram.robot.front import Front, stamp_of
+from engram.robot.mapping import LookedAhead, stretches
+from engram.robot.settings import Settings
+from engram.viewing.pictures import side_picture
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.studies.faults.injected import (
     Frozen,

@@ -11,13 +11,15 @@ import pytest
 from tests.scenes import Scene
 from tests.synthetic_world import CAMERA, Seen, World, drive
 
-from engram.doctor import Examination, Finding
-from engram.doctor.rematching import APART, MOST, Rematched
+from engram.doctor.examination import APART, MOST, Examination, Rematched
+from engram.doctor.table import Finding
 from engram.frontend.matching import MatcherConfig
-from engram.geometry import SE3, StereoCamera
-from engram.maps import open_map
-from engram.robot import Robot, Settings
-from engram.sequences import LoggedFrame
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+from engram.maps.map import open_map
+from engram.robot.robot import Robot
+from engram.robot.settings import Settings
+from engram.sequences.sequence import LoggedFrame
 
 HERE = SE3.exp([0.3, -0.05, 1.0, 0.02, 0.06, 0.01])
 WORLD = World(40.0)

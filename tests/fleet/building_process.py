@@ -7,10 +7,10 @@ import sys
 import threading
 from pathlib import Path
 
-from engram.fleet.build import build_map
+from engram.fleet.build.building import build_map
 from engram.monitor import Monitor
 from engram.processes import end_with_parent
-from engram.robot import Settings
+from engram.robot.settings import Settings
 
 from .builds import options
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import signal
 
-from engram.fleet.build import BuildOptions, JudgeOptions, build_map
+from engram.fleet.build.building import BuildOptions, build_map
+from engram.fleet.build.orders import JudgeOptions
 from engram.monitor import QUIET, Monitor
-from engram.robot import RobotOptions, Settings
+from engram.robot.settings import RobotOptions, Settings
 
 from .robots import OPTIONS
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from engram.fleet.merge import merge
+from engram.fleet.merge.merging import merge
 from engram.maps import writer
 
 from .robots import OPTIONS

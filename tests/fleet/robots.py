@@ -11,12 +11,17 @@ import numpy as np
 from tests.mapping_rig import Mapped, map_simulated
 from tests.synthetic_world import World, drive
 
-from engram.fleet.merge import MergeOptions, MergeReport, merge
-from engram.frontend import DescriptorKind
-from engram.geometry import SE3
+from engram.fleet.merge.merging import merge
+from engram.fleet.merge.report import MergeReport
+from engram.fleet.merge.settings import MergeOptions
+from engram.frontend.frame import DescriptorKind
+from engram.geometry.se3 import SE3
 from engram.graph.model import Clock, NodeId, Session
-from engram.maps import Map, StoredNode
-from engram.sequences import FrameLogHeader, FrameLogWriter, LoggedFrame, SequenceInfo
+from engram.maps.map import Map
+from engram.maps.records import StoredNode
+from engram.sequences.framelog.file import FrameLogHeader
+from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.sequence import LoggedFrame, SequenceInfo
 
 DAY_NS = 86_400_000_000_000
 HOUR_NS = 3_600_000_000_000

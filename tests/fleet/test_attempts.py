@@ -12,10 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.worlds import attempts_of
 
-from engram.fleet.download import DownloadOptions, download
-from engram.graph.attempts import Attempts
+from engram.fleet.download.downloading import download
+from engram.fleet.download.mission import DownloadOptions
 from engram.graph.model import SessionId
-from engram.maps import Map
+from engram.graph.paths import Attempts
+from engram.maps.map import Map
 
 from .robots import merged, rewritten, robot_map
 

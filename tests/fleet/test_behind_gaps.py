@@ -11,14 +11,14 @@ import pytest
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import PERIOD_NS, drive
 
-from engram.fleet.merge import Seed
-from engram.fleet.merge.behind_gaps import position_behind_gap
-from engram.fleet.merge.segments import Segment
-from engram.geometry import SE3
+from engram.fleet.merge.replay import Segment, position_behind_gap
+from engram.fleet.merge.report import Seed
+from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind, Node, SessionId, node_id
-from engram.localiser import Position
-from engram.maps import open_map
-from engram.odometry import GapConfig, OdometryStatus, OdometryStep
+from engram.localiser.localisation import Position
+from engram.maps.map import open_map
+from engram.odometry.motion import GapConfig
+from engram.odometry.step import OdometryStatus, OdometryStep
 
 from .robots import DAY_NS, WORLD, merged, robot_map, truth_of
 

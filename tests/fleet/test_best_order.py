@@ -10,10 +10,14 @@ from pathlib import Path
 import pytest
 
 from engram.errors import ConfigError, MapError
-from engram.fleet.build import Orders, best_order, building, find_best_order, orders
-from engram.maps import copy_map
+from engram.fleet.build import building, orders
+from engram.fleet.build.building import find_best_order
+from engram.fleet.build.orders import Orders
+from engram.maps.map_files import copy_map
 from engram.monitor import QUIET
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 
 from .builds import build, in_this_process, judge
 from .robots import OPTIONS
@@ -80,7 +84,7 @@ def test_verdicts_on_other_maps_or_by_other_judges_are_not_used(
         "groups": ([maps[0], maps[2]], by),
     }
     shutil.copytree(searched[0], tmp_path, dirs_exist_ok=True)
-    monkeypatch.setattr(best_order, "merge", killed)
+    monkeypatch.setattr(building, "merge", killed)
     search(tmp_path, groups, by)
     with pytest.raises(KilledError):
         search(tmp_path, *others[what])
@@ -92,7 +96,7 @@ def test_a_search_that_was_killed_counts_what_it_had_done(tmp_path, maps, logs, 
     def dies_over_the_second(*arguments):
         nonlocal calls
         calls += 1
-        return killed() if calls == 2 else best_order.measure(*arguments)
+        return killed() if calls == 2 else building.measure(*arguments)
 
     with pytest.raises(KilledError):
         search(tmp_path, maps[:2], judge(logs["held-out"], localise=dies_over_the_second))
@@ -211,7 +215,7 @@ def test_a_centre_that_is_written_to_while_orders_are_tried_is_told(
     copy_map(maps[2], centre)
 
     def meanwhile(*arguments):
-        found = best_order.measure(*arguments)
+        found = building.measure(*arguments)
         building.merge(centre, [maps[1]], OPTIONS)
         return found
 
@@ -231,7 +235,7 @@ def test_an_order_is_settled_before_the_first_merge(tmp_path, logs, monkeypatch)
     for other in (None, judge(logs["other"])):
         with pytest.raises(ConfigError, match="being merged already, in the order"):
             build(centre, logs, "ab", judge=other)
-    monkeypatch.setattr(best_order, "measure", never)
+    monkeypatch.setattr(building, "measure", never)
     report = build(centre, logs, "ab", judge=judge(logs["held-out"]), keep=True)
     assert report.best.spent.judge_s > 0
     assert report.content_hash == report.best.results[0].content_hash

@@ -10,8 +10,8 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from engram.fleet.download.bridges import close_gaps
-from engram.geometry import SE3, propagate_covariance
+from engram.fleet.download.part import close_gaps
+from engram.geometry.se3 import SE3, propagate_covariance
 from engram.graph.model import Edge, EdgeKind, NodeId
 
 

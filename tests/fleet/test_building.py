@@ -15,10 +15,12 @@ from pathlib import Path
 import pytest
 
 from engram.errors import ConfigError, EngramError, SequenceError, WorkerError
-from engram.fleet.build import JudgeOptions, build_map, order_costs
-from engram.maps import Map, check_file
+from engram.fleet.build.building import build_map
+from engram.fleet.build.orders import JudgeOptions, order_costs
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 from engram.monitor import Monitor
-from engram.robot import RobotOptions, Settings
+from engram.robot.settings import RobotOptions, Settings
 
 from .builds import Interrupting, build, options
 

@@ -7,8 +7,8 @@ from itertools import combinations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engram.fleet.merge.checks import Span, overlapping
-from engram.testing.situations import session_record
+from engram.fleet.merge.state import Span, overlapping
+from engram.testing.contracts import session_record
 
 # Short spans on a short time line: many touch, many begin together.
 SPANS = st.lists(st.tuples(st.integers(0, 30), st.integers(0, 8), st.booleans()), max_size=14)

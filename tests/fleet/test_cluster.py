@@ -11,11 +11,11 @@ import pytest
 from engram.errors import SequenceError, WorkerError
 from engram.fleet.build import cluster
 from engram.fleet.build.cluster import map_groups_on_cluster
-from engram.fleet.build.group_mapping import GroupTask
-from engram.maps import check_file
+from engram.fleet.build.scratch import GroupTask
+from engram.maps.map_files import check_file
 from engram.monitor import Monitor
 from engram.processes import _WORDS_AT_ONCE
-from engram.robot import Settings
+from engram.robot.settings import Settings
 
 from .builds import build, options
 

@@ -10,13 +10,18 @@ import pytest
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import drive
 
-from engram.fleet.download import DownloadOptions
-from engram.fleet.download.affinity import affinities
-from engram.fleet.download.coverage import Coverage, Demand, expected_missed, greedy_order
+from engram.fleet.download.coverage import (
+    Coverage,
+    Demand,
+    affinities,
+    expected_missed,
+    greedy_order,
+)
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.part import Stock
 from engram.fleet.download.selections import coverage_for
-from engram.fleet.download.stock import Stock
 from engram.graph.basin import MatchBasin
-from engram.maps import Map
+from engram.maps.map import Map
 
 from .robots import DAY_NS, WORLD
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from engram.errors import ConfigError
-from engram.fleet.download import DownloadOptions, daylight
-from engram.fleet.download.daylight import importance, learnt_latitude
-from engram.graph.clock import hour_of_day
+from engram.fleet.download import coverage
+from engram.fleet.download.coverage import importance, learnt_latitude
+from engram.fleet.download.mission import DownloadOptions
+from engram.graph.clock import day_of_year, hour_of_day, sun_height_deg
 from engram.graph.model import Clock, Session, SessionId
-from engram.graph.sun import day_of_year, sun_height_deg
 
 CAMERAS = {"camera": SimpleNamespace(fx=400.0)}
 
@@ -38,7 +38,7 @@ DECEMBER_NOON = session(4, datetime(2026, 12, 20, 12, 0, tzinfo=UTC))
 @pytest.fixture
 def no_attempts(monkeypatch):
     monkeypatch.setattr(
-        daylight, "tallies", lambda stock, basin: np.zeros((2, *[len(stock.sessions)] * 2))
+        coverage, "tallies", lambda stock, basin: np.zeros((2, *[len(stock.sessions)] * 2))
     )
 
 
@@ -61,7 +61,7 @@ def year(monkeypatch):
         rate = np.full(apart.shape, 0.6) if latitude_deg is None else 0.95 * np.exp(-apart / 5)
         tried = rng.integers(0, 30, rate.shape).astype(float)
         won = rng.binomial(tried.astype(int), rate).astype(float)
-        monkeypatch.setattr(daylight, "tallies", lambda stock, basin: (won, tried.copy()))
+        monkeypatch.setattr(coverage, "tallies", lambda stock, basin: (won, tried.copy()))
         return stock(*drives)
 
     return at

@@ -29,16 +29,24 @@ from engram.errors import (
     RefusedError,
     SequenceError,
 )
-from engram.fleet.merge import MergeOptions, gate, merge, merging, steps
+from engram.fleet.merge import gate, merging
 from engram.fleet.merge.gate import check_held_out, what_is_worse
+from engram.fleet.merge.merging import merge
 from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, SegmentReport
-from engram.frontend import TEBLID
-from engram.geometry import SE3
+from engram.fleet.merge.settings import MergeOptions
+from engram.frontend.frame import TEBLID
+from engram.geometry.se3 import SE3
 from engram.graph.model import Clock, NodeId, Omission, SessionId
-from engram.maps import Map, RevisionWriter, check_file, copy_map
+from engram.maps.map import Map
+from engram.maps.map_files import check_file, copy_map
+from engram.maps.writer import RevisionWriter
 from engram.measures import Drive
 from engram.monitor import QUIET, Monitor
-from engram.robot import RobotOptions, Settings, map_drive, measure, open_drive, session_of_drive
+from engram.robot.localisers import session_of_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import measure
+from engram.sequences.opening import open_drive
 
 from .robots import frame_log, merged, rewritten, robot_map
 
@@ -562,13 +570,13 @@ class TestInterrupted:
 
     def test_when_all_nodes_were_looked_at(self, centre, fleet, pressed):
         before = hash_of(centre)
-        pressed(steps, "_carry_attempts")
+        pressed(merging, "_carry_attempts")
         (report,) = merged(centre, fleet["longer"][0])
         assert report.interrupted
         assert hash_of(centre) == before
 
     def test_in_a_map_with_nothing_new(self, centre, fleet, pressed):
-        pressed(steps, "notes")
+        pressed(merging, "notes")
         (report,) = merged(centre, fleet["first"][0], fleet["longer"][0])
         assert report.interrupted
 

@@ -15,13 +15,14 @@ from tests.synthetic_world import drive
 from tests.worlds import attempts_of
 
 from engram.errors import ConfigError, InputError, MapError, NotAMapError, RevisionError
-from engram.fleet.download import DownloadOptions, DownloadReport, download
-from engram.fleet.download.downloading import most_that_fit
+from engram.fleet.download.downloading import DownloadReport, download, most_that_fit
+from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.selections import SELECTIONS, UNDERSTOOD
-from engram.frontend import BRIEF
+from engram.frontend.frame import BRIEF
 from engram.graph.model import Amendable, EdgeKind, path_id
-from engram.maps import Map, check_file, copy_map
-from engram.places import default_vocabulary
+from engram.maps.map import Map
+from engram.maps.map_files import check_file, copy_map
+from engram.places.vocabulary import default_vocabulary
 from engram.places.words import NodeWords
 
 from .robots import DAY_NS, WORLD, merged

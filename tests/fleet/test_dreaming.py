@@ -18,19 +18,28 @@ from sqlalchemy import Engine, event
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
-from engram.centre.worker import watching
+from engram.centre import merging
 from engram.errors import ConfigError, InputError
 from engram.fleet.build.orders import JudgeOptions
-from engram.fleet.dream import DreamOptions, dream, hand_ins_of, keep_hand_in
-from engram.fleet.dream.dreaming import BEHAVIOURS
-from engram.fleet.dream.judging import gain
-from engram.fleet.dream.trying import Try, try_all
+from engram.fleet.dream import (
+    BEHAVIOURS,
+    DreamOptions,
+    Try,
+    dream,
+    gain,
+    hand_ins_of,
+    keep_hand_in,
+    try_all,
+)
 from engram.graph.model import Clock
-from engram.maps import Map, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 from engram.measures import Drive
 from engram.monitor import Monitor
-from engram.robot import RobotOptions, Settings
-from engram.sequences import FrameLogHeader, FrameLogWriter, SequenceInfo
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.framelog.file import FrameLogHeader
+from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.sequence import SequenceInfo
 
 from .robots import DAY_NS, OPTIONS, merged
 
@@ -243,9 +252,9 @@ def orders_tried(robots: list[Path], drives: list[Path], folder: Path) -> Try:
 def test_whoever_watches_a_dream_learns_how_much_there_is_to_try(
     town, tmp_path, monkeypatch, end_s
 ):
-    monkeypatch.setattr(watching, "_TELL_S", 0.0)
+    monkeypatch.setattr(merging, "_TELL_S", 0.0)
     told: list[str] = []
-    monitor = watching.Watching(lambda progress: bool(told.append(progress)))
+    monitor = merging.Watching(lambda progress: bool(told.append(progress)))
     asked = replace(orders_tried(town[1], town[2], tmp_path / "results"), end_s=end_s)
     assert try_all({"usual": asked}, 1, None, monitor)
     assert told[-1] == "try orders: 1 of 2"

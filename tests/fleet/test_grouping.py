@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import ConfigError
-from engram.fleet.build.grouping import GROUPINGS, Drive, group_drives
+from engram.fleet.build.building import GROUPINGS, Drive, group_drives
 from engram.graph.model import Clock, Session, SessionId
-from engram.testing.situations import CAMERA
+from engram.testing.contracts import CAMERA
 
 HOUR_NS = 3_600_000_000_000
 

@@ -12,15 +12,19 @@ from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive, see
 from tests.worlds import attempts_of
 
-from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge import Reason, Seed
+from engram.fleet.download.downloading import download
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.merge.report import Reason, Seed
 from engram.graph.model import EdgeKind, PathEntryKind, path_id
 from engram.graph.placing import PlacingConfig
 from engram.graph.proximity import ProximityConfig
-from engram.localiser import Localiser
-from engram.mapper import MapperConfig
-from engram.maps import Map, check_file, open_map
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
+from engram.localiser.localiser import Localiser
+from engram.mapper.mapper import MapperConfig
+from engram.maps.map import Map, open_map
+from engram.maps.map_files import check_file
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 
 from .robots import OPTIONS, frame_log, merged, robot_map, truth_of
 

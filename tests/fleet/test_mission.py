@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from engram.errors import ConfigError
-from engram.fleet.download import budget_from_text, hour_from_text
+from engram.fleet.download.mission import budget_from_text, hour_from_text
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ import pytest
 from tests.mapping_rig import map_simulated
 
 from engram.errors import ConfigError, InputError
-from engram.fleet.download import DownloadOptions, download
-from engram.fleet.download.forecast import (
+from engram.fleet.download.coverage import (
     BINS,
     INTERVALS,
     LEVEL,
@@ -20,9 +19,12 @@ from engram.fleet.download.forecast import (
     Light,
     Weather,
 )
+from engram.fleet.download.downloading import download
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.part import Stock
 from engram.fleet.download.selections import SELECTIONS, along_route, mission_area
-from engram.fleet.download.stock import Stock
-from engram.maps import Map, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 
 from .test_download import DRIVES, steps_of
 
@@ -124,7 +126,7 @@ def test_widening_stops_at_the_nearest_hours(stock):
 
 
 def test_without_any_hour_near_everything_of_the_area_goes_along(stock, monkeypatch):
-    monkeypatch.setattr("engram.fleet.download.by_time._WIDEST_MIN", 100.0)
+    monkeypatch.setattr("engram.fleet.download.selections._WIDEST_MIN", 100.0)
     options = options_of(stock, "tod", "route", WITHOUT)
     found = SELECTIONS["tod"](stock, options)
     assert (found.sent == along_route(stock, options.route, 2.0)).all()

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from engram.fleet.merge.state import Merge
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
-from engram.maps import Map
+from engram.maps.map import Map
 
 
 @pytest.fixture

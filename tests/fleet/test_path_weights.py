@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import InputError
-from engram.fleet.download.path_weights import count_paths, epoch_count, epoch_of, mission_epochs
+from engram.fleet.download.selections import count_paths, epoch_count, epoch_of, mission_epochs
 from engram.graph.model import PathId
 
 P1, P2, P3 = (PathId(UUID(int=number)) for number in (1, 2, 3))

@@ -7,21 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge import MergeReport
-from engram.fleet.merge import merge as merge_maps
+from engram.fleet.download.downloading import download
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.merge.merging import merge as merge_maps
+from engram.fleet.merge.report import MergeReport
 from engram.graph.model import NodeId, Omission
-from engram.maps import Map, check_file
-from engram.robot import (
-    RobotOptions,
-    Settings,
-    localise_drive,
-    map_drive,
-    open_drive,
-    open_map,
-    summarise,
-)
-from engram.sequences.trajectories import Trajectory
+from engram.maps.map import Map, open_map
+from engram.maps.map_files import check_file
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import localise_drive, summarise
+from engram.sequences.motion import Trajectory
+from engram.sequences.opening import open_drive
 from engram_lab.truth import read_kitti_poses, read_matrix_truth
 
 pytestmark = pytest.mark.data

@@ -11,10 +11,14 @@ from pathlib import Path
 import pytest
 
 from engram.errors import ConfigError, InputError, MapError, MapLockedError, StorageFullError
-from engram.fleet.build import building, find_best_order
+from engram.fleet.build import building
+from engram.fleet.build.building import find_best_order
 from engram.fleet.build.scratch import BuildPlan, Scratch, build_folder, sessions_of
-from engram.maps import copy_map
-from engram.robot import Settings, map_drive, open_drive, session_of_drive
+from engram.maps.map_files import copy_map
+from engram.robot.localisers import session_of_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import Settings
+from engram.sequences.opening import open_drive
 
 from .builds import build, in_this_process, judge, options
 from .robots import OPTIONS

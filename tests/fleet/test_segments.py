@@ -9,10 +9,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engram.fleet.merge.segments import string_segments
-from engram.geometry import SE3
+from engram.fleet.merge.replay import string_segments
+from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind, Node, node_id
-from engram.testing.situations import CAMERA, session_uuid
+from engram.testing.contracts import CAMERA, session_uuid
 
 
 def make_node(session: int, stamp_ns: int) -> Node:

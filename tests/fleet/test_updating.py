@@ -19,8 +19,10 @@ from tests.maps.frames import CAMERA, FRONTEND
 from tests.maps.maps import attempt, begin, edge, node, node_frame, session
 
 from engram.errors import IncompatibleError, InputError, MapLockedError, RevisionError
-from engram.fleet.download import DownloadOptions, download, update
-from engram.frontend import BRIEF
+from engram.fleet.download.downloading import download
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.updating import update
+from engram.frontend.frame import BRIEF
 from engram.graph.model import (
     Amendable,
     Edge,
@@ -31,7 +33,9 @@ from engram.graph.model import (
     Session,
     path_id,
 )
-from engram.maps import Map, check_file, writer
+from engram.maps import writer
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 from engram.maps.writer import RevisionWriter
 
 DAY_NS = 86_400_000_000_000

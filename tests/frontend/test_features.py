@@ -19,23 +19,12 @@ from engram import _core
 from engram.cli.app import app
 from engram.config import config_hash
 from engram.errors import ConfigError, IncompatibleError, MapCorruptError
-from engram.frontend import (
-    BRIEF,
-    FEATURES,
-    TEBLID,
-    DescriptorKind,
-    FeatureKind,
-    Frame,
-    Frontend,
-    FrontendConfig,
-    MatcherConfig,
-    StereoPair,
-    match_frames,
-    network,
-)
+from engram.frontend import features as network
 from engram.frontend.blobs import decode_landmarks, encode_landmarks
 from engram.frontend.features import (
+    FEATURES,
     NET,
+    FeatureKind,
     describe_brief,
     describe_net,
     detect_corners,
@@ -43,19 +32,23 @@ from engram.frontend.features import (
     fitted_matcher,
     known_kinds,
 )
-from engram.geometry import StereoCamera
-from engram.maps import Map
-from engram.places import (
+from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind, Frame, StereoPair
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.frontend.matching import MatcherConfig, match_frames
+from engram.geometry.cameras import StereoCamera
+from engram.maps.map import Map
+from engram.places.vocabulary import (
     TrainingConfig,
     decode_vocabulary,
+    default_vocabulary,
     encode_vocabulary,
     train_vocabulary,
 )
-from engram.places.vocabulary import default_vocabulary
-from engram.robot import Settings
-from engram.robot.recording import extract_log
-from engram.sequences import FrameLog, open_drive
-from engram.testing import check_kind, unmet
+from engram.robot.mapping import extract_log
+from engram.robot.settings import Settings
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.opening import open_drive
+from engram.testing.contracts import check_kind, unmet
 
 CAMERA = StereoCamera(260.0, 260.0, 160.0, 120.0, 0.2, 320, 240)
 BOTH = DescriptorKind("both")

@@ -10,20 +10,11 @@ from tests.opencv import needs_contrib
 
 from engram.config import from_dict, to_dict
 from engram.errors import ConfigError, SequenceError
-from engram.frontend import (
-    BRIEF,
-    FEATURES,
-    TEBLID,
-    DescriptorKind,
-    FrameStatus,
-    Frontend,
-    FrontendConfig,
-    StereoPair,
-)
-from engram.frontend.features import describe_brief
-from engram.frontend.frontend import make_thumbnail
-from engram.frontend.quantisation import pixel_quantum, quantise
-from engram.geometry import StereoCamera
+from engram.frontend.blobs import pixel_quantum, quantise
+from engram.frontend.features import FEATURES, describe_brief
+from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind, FrameStatus, StereoPair
+from engram.frontend.frontend import Frontend, FrontendConfig, make_thumbnail
+from engram.geometry.cameras import StereoCamera
 
 CAMERA = StereoCamera(260.0, 260.0, 160.0, 120.0, 0.2, 320, 240)
 LEFT, RIGHT = shifted_pair(240, 320, 12.25, seed=1, noise=2.0)

@@ -9,9 +9,9 @@ from tests.reference import guided_matching
 from tests.scenes import Scene
 
 from engram import _core
-from engram.frontend import Frame, MatcherConfig
-from engram.frontend.matching import core_settings, features
-from engram.geometry import SE3
+from engram.frontend.frame import Frame
+from engram.frontend.matching import MatcherConfig, core_settings, features
+from engram.geometry.se3 import SE3
 
 CONFIG = MatcherConfig()
 REFERENCE_FROM_LIVE = SE3.exp([0.2, -0.05, 0.6, 0.02, 0.05, 0.01])

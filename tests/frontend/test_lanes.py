@@ -10,7 +10,7 @@ from tests.scenes import Scene
 
 from engram.errors import InputError
 from engram.frontend.matching import Lanes, Match, MatcherConfig, Question, match_frames
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 
 CONFIG = MatcherConfig()
 AHEAD = SE3.exp([0.2, -0.05, 1.0, 0.02, 0.1, 0.01])

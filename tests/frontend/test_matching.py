@@ -10,7 +10,7 @@ from tests.scenes import CAMERA, Scene, normalised_error
 
 from engram import _core
 from engram.errors import ConfigError, IncompatibleError, InputError
-from engram.frontend import TEBLID
+from engram.frontend.frame import TEBLID
 from engram.frontend.matching import (
     MatcherConfig,
     core_settings,
@@ -19,7 +19,8 @@ from engram.frontend.matching import (
     matcher_hash,
     pair_seed,
 )
-from engram.geometry import SE3, StereoCamera
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 
 CONFIG = MatcherConfig()
 # What the scenes' noise is: independent, without a common offset.
@@ -264,7 +265,7 @@ sys.path.insert(0, sys.argv[1])
 from tests.scenes import Scene
 from engram import _core
 from engram.frontend.matching import MatcherConfig, match_frames
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 digest = hashlib.sha256()
 for seed in range(4):
     scene = Scene(400, seed)

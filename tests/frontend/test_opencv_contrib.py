@@ -12,7 +12,8 @@ from tests.cli.conftest import engram  # noqa: F401
 from tests.core.textures import texture
 
 from engram.errors import MissingExtraError
-from engram.frontend import FEATURES, TEBLID
+from engram.frontend.features import FEATURES
+from engram.frontend.frame import TEBLID
 from engram_lab.bench.data import BenchData, synthetic_drive
 from engram_lab.bench.runner import run_bench
 from engram_lab.fits.reference_matcher import reference_frame

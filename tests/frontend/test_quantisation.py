@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from engram.errors import InputError
-from engram.frontend.quantisation import (
+from engram.frontend.blobs import (
     SIGMA_TABLE_PX,
     LandmarkCodes,
     dequantise,
@@ -16,7 +16,7 @@ from engram.frontend.quantisation import (
     quantise,
     quantised_landmarks,
 )
-from engram.geometry import StereoCamera
+from engram.geometry.cameras import StereoCamera
 
 sizes = st.integers(1, 65535)
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from engram.errors import CalibrationError
-from engram.geometry import SE3, StereoCamera
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 
 CAMERA = StereoCamera(707.0, 707.0, 601.9, 183.1, 0.537, 1226, 370)
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from engram.errors import CalibrationError
-from engram.geometry import SE3
 from engram.geometry.rectification import (
     DistortionModel,
     RawCamera,
@@ -15,6 +14,7 @@ from engram.geometry.rectification import (
     RemapTable,
     rectify,
 )
+from engram.geometry.se3 import SE3
 
 BROWN = RawCamera(
     458.7, 457.3, 367.2, 248.4, 752, 480, DistortionModel.RADIAL_TANGENTIAL,

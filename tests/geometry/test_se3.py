@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from engram.errors import InputError
-from engram.geometry import SE3, propagate_covariance
+from engram.geometry.se3 import SE3, propagate_covariance
 
 scales = st.sampled_from([1e-9, 1e-5, 1e-4, 1e-2, 1.0])
 directions = arrays(np.float64, 6, elements=st.floats(-1, 1)).filter(

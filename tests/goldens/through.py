@@ -13,24 +13,23 @@ import numpy as np
 from platformdirs import user_cache_path
 
 import engram
-from engram import _core, maps
+from engram import _core
 from engram.fleet.build.building import BuildOptions, build_map
-from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge import merge as merge_maps
-from engram.frontend import Frame, Frontend, StereoPair
-from engram.localiser import Localisation
-from engram.maps import Map, open_map
+from engram.fleet.download.downloading import download
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.merge.merging import merge as merge_maps
+from engram.frontend.frame import Frame, StereoPair
+from engram.frontend.frontend import Frontend
+from engram.localiser.localisation import Localisation
+from engram.maps import map_files
 from engram.maps.history import revert_revision
-from engram.odometry import Odometry
-from engram.robot import (
-    DriveSequence,
-    RobotOptions,
-    Settings,
-    localise_drive,
-    map_drive,
-    open_drive,
-    session_of_drive,
-)
+from engram.maps.map import Map, open_map
+from engram.odometry.odometry import Odometry
+from engram.robot.localisers import DriveSequence, session_of_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import localise_drive
+from engram.sequences.opening import open_drive
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.there_and_back import ThereAndBack
 from engram_lab.town.campaigns import campaign_named
@@ -182,7 +181,7 @@ def contents(path: Path) -> Values:
 
 
 def copy_map(source: Path, target: Path) -> None:
-    maps.copy_map(source, target)
+    map_files.copy_map(source, target)
 
 
 def robot_over(path: Path, sequence: DriveSequence) -> Iterator[object]:

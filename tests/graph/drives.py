@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from tests.worlds import covariance_of
 
-from engram.geometry import SE3, propagate_covariance
+from engram.geometry.se3 import SE3, propagate_covariance
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind
 from engram.graph.neighbourhood import Search
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
-from engram.testing.situations import make_node, session_uuid
+from engram.testing.contracts import make_node, session_uuid
 
 GATE_RAD = np.deg2rad(60)
 MATCH_BASIN_M = 2.0

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engram.errors import InputError
-from engram.geometry import SE3, CameraId
-from engram.graph.edge_table import EDGE_KINDS, EdgeTable
-from engram.graph.graph import ExperienceGraph
+from engram.geometry.cameras import CameraId
+from engram.geometry.se3 import SE3
+from engram.graph.graph import EDGE_KINDS, EdgeTable, ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, SessionId, node_id
 
 ARRAYS = ("_first_half", "_next_half", "_target", "_a_from_b", "_errors", "_experiences")

@@ -10,7 +10,7 @@ from tests.reference import basin as reference
 from engram.errors import InputError
 from engram.graph.basin import BasinCounts, MatchBasin, _falling, count_attempts, prior_basin_m
 from engram.graph.model import Attempt
-from engram.testing.situations import make_node
+from engram.testing.contracts import make_node
 
 NODE = make_node(0, 0).id
 

@@ -10,8 +10,8 @@ from tests.reference.graph_search import variance_at
 from tests.worlds import covariance_of, forward
 
 from engram.errors import InputError
-from engram.geometry import SE3, propagate_covariance
-from engram.graph.chain_error import ChainError, PivotedError
+from engram.geometry.se3 import SE3, propagate_covariance
+from engram.graph.basin import ChainError, PivotedError
 
 
 def random_covariance(seed: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from engram.errors import ConfigError
 from engram.graph.clock import check_longitude, check_zone, hour_of_day, zone_note
 from engram.graph.model import Clock
-from engram.sequences import SequenceInfo
+from engram.sequences.sequence import SequenceInfo
 
 
 def info(longitude_deg=None, zone=None, clock=Clock.UTC) -> SequenceInfo:

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engram.graph.components import grouped, labels_of
+from engram.graph.graph import grouped, labels_of
 
 
 @given(st.integers(0, 12).flatmap(

@@ -5,7 +5,7 @@ from uuid import UUID
 import numpy as np
 import pytest
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind, NodeId
 from engram.graph.proximity import _fused
 

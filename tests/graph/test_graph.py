@@ -10,11 +10,11 @@ from tests.reference import graph_search as oracle
 from tests.worlds import covariance_of, forward, make_edge
 
 from engram.errors import InputError
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind
 from engram.graph.neighbourhood import Search, SearchConfig
-from engram.testing.situations import make_node, session_uuid
+from engram.testing.contracts import make_node, session_uuid
 
 TIGHT = covariance_of(1e-3, 1e-4)
 

@@ -4,19 +4,22 @@ import numpy as np
 import pytest
 from tests.worlds import covariance_of
 
-from engram.geometry import SE3
-from engram.graph.adjusting import AdjustConfig, Measured, Poses, adjust
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind
 from engram.graph.placing import (
+    AdjustConfig,
     Anchored,
+    Measured,
     PlacingConfig,
+    Poses,
+    adjust,
     anchor,
     fit_level,
     place,
     replace_after_removal,
 )
-from engram.testing.situations import make_node
+from engram.testing.contracts import make_node
 
 SIGMA_M, SIGMA_RAD = 0.01, 0.001
 

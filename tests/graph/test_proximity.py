@@ -5,12 +5,12 @@ import pytest
 from tests.graph.drives import Fleet, Route, Tally
 from tests.worlds import covariance_of, forward, make_edge
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind
 from engram.graph.neighbourhood import Search
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
-from engram.testing.situations import make_node
+from engram.testing.contracts import make_node
 
 # Per step of 1 m: 1 % of the way and 0.02 degrees, fresh at each step.
 GOOD_ODOMETRY = (0.01, np.deg2rad(0.02))

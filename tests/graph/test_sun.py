@@ -7,8 +7,8 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from engram.graph.sun import day_of_year, sun_height_deg
-from engram_lab.town.sky import sun_direction
+from engram.graph.clock import day_of_year, sun_height_deg
+from engram_lab.town.conditions import sun_direction
 
 
 @pytest.mark.parametrize("latitude_deg", [-50.0, 0.0, 23.4, 51.8, 70.0])

@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterator
 from threading import Condition
 from typing import Any
 
-from engram.live import Command, FrameEvent
-from engram.live.outside import Outside
-from engram.live.transport import Message
+from engram.live.driving import Outside
+from engram.live.served import Command, FrameEvent, Message
 from engram.robot.front import Arrived
 
 

@@ -21,10 +21,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import engram.live.link
-from engram.frontend import StereoPair
-from engram.geometry import SE3
-from engram.localiser import LocalisationStatus
-from engram.robot import map_drive, open_drive
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
+from engram.localiser.localisation import LocalisationStatus
+from engram.robot.mapping import map_drive
+from engram.sequences.opening import open_drive
 
 PACKAGE = Path(__file__).parents[2] / "ros" / "engram_bridge"
 if not PACKAGE.exists():

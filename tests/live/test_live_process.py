@@ -20,16 +20,20 @@ import pytest
 from tests.live.in_process import InProcess
 
 from engram.errors import InputError, MapError
-from engram.frontend import StereoPair
-from engram.geometry import SE3
-from engram.live import LiveOptions, LiveProcess, Played, Served, process
-from engram.live.driving import Driving
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
+from engram.live import process
+from engram.live.driving import Driving, LiveOptions, Outside
 from engram.live.link import Link, Ring
-from engram.live.outside import Outside
-from engram.localiser import Localiser
-from engram.maps import Map, open_map
-from engram.robot import Robot, RobotOptions, map_drive, open_drive
-from engram.robot.goals import add_goal
+from engram.live.process import LiveProcess
+from engram.live.served import Played, Served
+from engram.localiser.localiser import Localiser
+from engram.maps.map import Map, open_map
+from engram.robot.anchors import add_goal
+from engram.robot.mapping import map_drive
+from engram.robot.robot import Robot
+from engram.robot.settings import RobotOptions
+from engram.sequences.opening import open_drive
 
 OPTIONS = RobotOptions(lanes=1, rounds=4)
 
@@ -447,7 +451,7 @@ def test_a_played_drive_waits_until_the_robot_is_ready(
     street: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = FakeClock()
-    for module in ("engram.live.transport", "engram.robot.front"):
+    for module in ("engram.live.served", "engram.robot.front"):
         monkeypatch.setattr(f"{module}.time", clock)
     took_s = {0: 30.0, 3: 0.25}  # opening the map; a frame that keeps the robot busy
     taken = []

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from engram.robot import map_drive, open_drive
+from engram.robot.mapping import map_drive
+from engram.sequences.opening import open_drive
 
 ROS_PYTHON = os.environ.get("ENGRAM_ROS_PYTHON")
 BRIDGE = Path(__file__).parents[2] / "ros" / "engram_bridge"

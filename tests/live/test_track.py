@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.live.driving import Step
-from engram.live.track import Track
-from engram.odometry import GapFiller, OdometryStatus, OdometryStep
+from engram.live.process import Track
+from engram.odometry.motion import GapFiller
+from engram.odometry.step import OdometryStatus, OdometryStep
 
 MS = 1_000_000
 DARK = OdometryStep(OdometryStatus.UNUSABLE_FRAME)

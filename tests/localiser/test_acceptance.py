@@ -5,9 +5,18 @@ import pytest
 from tests.synthetic_world import World, see
 
 from engram.frontend.matching import Match
-from engram.geometry import SE3
-from engram.localiser import AcceptanceConfig, Prediction, Spread, accept, accept_lost, plausible
-from engram.localiser.spread import _extent, _median, inlier_spread
+from engram.geometry.se3 import SE3
+from engram.localiser.acceptance import (
+    AcceptanceConfig,
+    Prediction,
+    Spread,
+    _extent,
+    _median,
+    accept,
+    accept_lost,
+    inlier_spread,
+    plausible,
+)
 
 CONFIG = AcceptanceConfig()
 WIDE = Spread(0.5, 0.9, 10.0)

@@ -18,11 +18,11 @@ from tests.synthetic_world import World, drive
 
 from engram.graph.graph import ExperienceGraph
 from engram.graph.paths import PathMemory
-from engram.localiser import Position
-from engram.maps import Map
-from engram.ranking import POLICIES
-from engram.robot import Settings
+from engram.localiser.localisation import Position
+from engram.maps.map import Map
+from engram.ranking.policies import POLICIES
 from engram.robot.localisers import localiser_in
+from engram.robot.settings import Settings
 
 WORLD = World(30.0)
 ROAD = np.arange(0.0, 25.0, 0.7)

@@ -6,10 +6,11 @@ from uuid import UUID
 import numpy as np
 import pytest
 
-from engram.geometry import SE3, CameraId
+from engram.geometry.cameras import CameraId
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
-from engram.localiser import BeliefConfig, PlaceBelief
+from engram.localiser.relocalisation import BeliefConfig, PlaceBelief
 
 AHEAD = SE3(np.eye(3), np.array([0.0, 0.0, 1.0]))
 SESSION = SessionId(UUID(int=1))

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from engram.frontend.matching import Match
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.model import NodeId
-from engram.localiser import Rule
-from engram.localiser.acceptance import AcceptanceConfig, Prediction
-from engram.localiser.attempts import Candidate, Outcome
-from engram.localiser.choice import best_success, outcome_at, uncontested
+from engram.localiser.acceptance import AcceptanceConfig, Prediction, Rule
+from engram.localiser.attempts import Candidate, Outcome, best_success, outcome_at, uncontested
 
 NOTHING = np.zeros(0, np.int32)
 

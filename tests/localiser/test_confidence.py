@@ -11,12 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engram.frontend import BRIEF, DescriptorKind
 from engram.frontend.features import NET
-from engram.geometry import SE3
+from engram.frontend.frame import BRIEF, DescriptorKind
+from engram.geometry.se3 import SE3
 from engram.graph.model import NodeId
-from engram.localiser import Position, Spread
-from engram.localiser.chain import FixChain
+from engram.localiser.acceptance import Spread
 from engram.localiser.confidence import (
     ANYWHERE_TERMS,
     DOUBTED_TERMS,
@@ -27,6 +26,8 @@ from engram.localiser.confidence import (
     Standing,
     confidence_of,
 )
+from engram.localiser.localisation import Position
+from engram.localiser.tracking import FixChain
 
 MODEL = confidence_of(BRIEF)
 WIDE = Spread(0.5, 0.9, 10.0)

@@ -11,16 +11,18 @@ from tests.localiser.test_hypotheses import GRAPH, SURE, ahead
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
-from engram.frontend import BRIEF
-from engram.geometry import SE3
+from engram.frontend.frame import BRIEF
+from engram.geometry.se3 import SE3
 from engram.graph.model import NodeId
-from engram.localiser import Position
 from engram.localiser.acceptance import Rule
 from engram.localiser.confidence import CONFIDENCES
-from engram.localiser.fusing import Track, fused
-from engram.maps import Map
-from engram.robot import Front, Robot, Settings
+from engram.localiser.localisation import Position
+from engram.localiser.tracking import Track, fused
+from engram.maps.map import Map
+from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
+from engram.robot.robot import Robot
+from engram.robot.settings import Settings
 
 NODE = GRAPH.node(10).id
 SMALL = st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6).map(np.array)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from engram.errors import ConfigError
-from engram.geometry import SE3
-from engram.odometry import OdometryStatus, OdometryStep
+from engram.geometry.se3 import SE3
 from engram.odometry.motion import GapConfig, GapFiller, Motion, driven_steps_m
+from engram.odometry.step import OdometryStatus, OdometryStep
 
 FIRST = OdometryStep(OdometryStatus.FIRST)
 BLIND = OdometryStep(OdometryStatus.NO_CONSENSUS)

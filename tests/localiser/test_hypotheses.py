@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from engram.frontend.matching import Match
-from engram.geometry import SE3, CameraId
+from engram.geometry.cameras import CameraId
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.graph.neighbourhood import Neighbourhood, Search
-from engram.localiser import AcceptanceConfig, Position
+from engram.localiser.acceptance import AcceptanceConfig
 from engram.localiser.attempts import Candidate, Outcome
-from engram.localiser.hypotheses import Hypotheses
+from engram.localiser.localisation import Position
+from engram.localiser.relocalisation import Hypotheses
 from engram.localiser.settings import HypothesesConfig
 
 SESSION = SessionId(UUID(int=1))

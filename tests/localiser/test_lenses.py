@@ -10,17 +10,18 @@ from tests.mapping_rig import localised, map_simulated
 from tests.synthetic_world import CAMERA, Seen, World, drive, see
 from tests.worlds import covariance_of, forward, make_edge
 
-from engram.geometry import SE3, StereoCamera
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Session
 from engram.graph.neighbourhood import Search
-from engram.localiser import Budget, Position
-from engram.localiser.lenses import Lenses
-from engram.maps import Map
-from engram.ranking import POLICIES
-from engram.robot import Settings
+from engram.localiser.acceptance import Lenses
+from engram.localiser.localisation import Budget, Position
+from engram.maps.map import Map
+from engram.ranking.policies import POLICIES
 from engram.robot.localisers import localiser_in
-from engram.testing.situations import make_node
+from engram.robot.settings import Settings
+from engram.testing.contracts import make_node
 
 WORLD = World(40.0, seed=3)
 ROAD = np.arange(0.0, 30.0, 0.7)

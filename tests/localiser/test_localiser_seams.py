@@ -9,12 +9,15 @@ from tests.mapping_rig import localised, map_simulated
 from tests.synthetic_world import PERIOD_NS, Seen, World, drive
 
 from engram.errors import MapCorruptError
-from engram.localiser import Budget, FrameMatcher, LocalisationStatus, Position
-from engram.maps import Map
-from engram.odometry import OdometryStatus, OdometryStep
-from engram.ranking import POLICIES
-from engram.robot import Front, Robot, Settings
+from engram.localiser.attempts import FrameMatcher
+from engram.localiser.localisation import Budget, LocalisationStatus, Position
+from engram.maps.map import Map
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.ranking.policies import POLICIES
+from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
+from engram.robot.robot import Robot
+from engram.robot.settings import Settings
 
 WORLD = World(30.0)
 ROAD = np.arange(0.0, 25.0, 0.7)

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from tests.synthetic_world import World, see
 
 from engram.errors import IncompatibleError
-from engram.frontend import BRIEF, TEBLID, Frame, Landmarks
 from engram.frontend.features import NET
+from engram.frontend.frame import BRIEF, TEBLID, Frame, Landmarks
 from engram.localiser.relocalisation import (
     RELOCALISERS,
     Exhaustive,
@@ -19,7 +19,7 @@ from engram.localiser.relocalisation import (
     spread,
     van_der_corput_order,
 )
-from engram.places import Vocabulary, default_vocabulary
+from engram.places.vocabulary import Vocabulary, default_vocabulary
 from engram.places.words import NodeWords
 
 

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from tests.synthetic_world import World, see
 
-from engram.frontend import BRIEF, Frame
+from engram.frontend.frame import BRIEF, Frame
 from engram.frontend.matching import Match
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.model import NodeId
-from engram.localiser import AcceptanceConfig, LocaliserConfig, Prediction, Rule, Spread
+from engram.localiser.acceptance import AcceptanceConfig, Prediction, Rule, Spread
 from engram.localiser.attempts import Attempter, Candidate, Outcome
 from engram.localiser.confidence import Standing, confidence_of
+from engram.localiser.settings import LocaliserConfig
 
 WORLD = World(40.0)
 LIVE, NODE = NodeId(UUID(int=1)), NodeId(UUID(int=2))

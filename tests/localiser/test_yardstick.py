@@ -11,9 +11,11 @@ from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
 from engram.localiser.yardstick import Likeness, LookalikeConfig, Run
-from engram.maps import Map
-from engram.robot import Front, Robot, Settings
+from engram.maps.map import Map
+from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
+from engram.robot.robot import Robot
+from engram.robot.settings import Settings
 
 STREET = World(90.0)
 

@@ -9,14 +9,15 @@ import pytest
 from tests.mapping_rig import localised, map_simulated
 from tests.synthetic_world import Seen, World, see
 
-from engram.fleet.download import DownloadOptions, download
-from engram.geometry import SE3
+from engram.fleet.download.downloading import download
+from engram.fleet.download.mission import DownloadOptions
+from engram.geometry.se3 import SE3
 from engram.graph.neighbourhood import Search
-from engram.localiser import Budget, Position
-from engram.maps import Map
-from engram.odometry import OdometryStatus, OdometryStep
-from engram.robot import Settings
+from engram.localiser.localisation import Budget, Position
+from engram.maps.map import Map
+from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.robot.localisers import localiser_in
+from engram.robot.settings import Settings
 
 LENGTH_M = 60.0
 WORLD = World(LENGTH_M, seed=21)

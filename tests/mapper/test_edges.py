@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from tests.worlds import forward, make_edge
 
-from engram.frontend import Match
-from engram.geometry import SE3
+from engram.frontend.matching import Match
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind
-from engram.localiser import AcceptanceConfig
+from engram.localiser.acceptance import AcceptanceConfig
 from engram.localiser.attempts import Candidate, Outcome
-from engram.mapper import match_edges
-from engram.testing.situations import flat_graph
+from engram.mapper.mapper import match_edges
+from engram.testing.contracts import flat_graph
 
 
 def chain(nodes: int, step_m: float, sigma_m: float, *, broken_at: int = -1) -> ExperienceGraph:

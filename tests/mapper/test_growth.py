@@ -11,16 +11,16 @@ from types import SimpleNamespace
 import numpy as np
 from tests.worlds import forward, make_edge
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, PathEntryKind, path_id
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
-from engram.localiser import AcceptanceConfig, Position
-from engram.localiser.chain import MOST_ON_TRIAL, FixChain
-from engram.mapper import Memory
+from engram.localiser.acceptance import AcceptanceConfig
+from engram.localiser.localisation import Position
+from engram.localiser.tracking import MOST_ON_TRIAL, FixChain
 from engram.mapper.loops import LoopSearch
-from engram.mapper.saver import Records
-from engram.testing.situations import make_node
+from engram.mapper.mapper import Memory, Records
+from engram.testing.contracts import make_node
 
 CHAIN = 20
 # Of Python's own; an array of one byte per node of the larger map is larger.

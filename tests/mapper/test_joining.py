@@ -12,9 +12,9 @@ import pytest
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import PERIOD_NS, Seen, World, drive
 
-from engram.geometry import SE3
-from engram.maps import Map, open_map
-from engram.odometry import OdometryStatus, OdometryStep
+from engram.geometry.se3 import SE3
+from engram.maps.map import Map, open_map
+from engram.odometry.step import OdometryStatus, OdometryStep
 
 STEP_M = 0.7
 # A street that was mapped, and others that are like nothing.

@@ -10,10 +10,10 @@ from tests.mapping_rig import Mapped, map_simulated
 from tests.synthetic_world import World, drive, see
 
 from engram.errors import MapCorruptError
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind
-from engram.localiser import FrameMatcher
-from engram.maps import Map
+from engram.localiser.attempts import FrameMatcher
+from engram.maps.map import Map
 
 # A lap of 151 m with a step every 0.7 m: 0.17° a step too much is 37° and 17 m at its end.
 LAP_M = 2 * np.pi * 24.0

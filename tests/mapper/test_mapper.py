@@ -10,16 +10,16 @@ import pytest
 from tests.mapping_rig import Mapped, errors_m, localise_simulated, map_simulated
 from tests.synthetic_world import World, drive
 
-from engram.frontend import FrameStatus
-from engram.geometry import SE3
+from engram.frontend.frame import FrameStatus
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, PathEntryKind
 from engram.graph.neighbourhood import Search
 from engram.graph.proximity import ProximityConfig
-from engram.mapper import MapperConfig
-from engram.maps import Map
-from engram.odometry import OdometryStatus, OdometryStep
-from engram.robot import Settings
+from engram.mapper.mapper import MapperConfig
+from engram.maps.map import Map
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.robot.settings import Settings
 
 WORLD = World(60.0)
 ROAD = np.arange(0.0, 55.0, 0.7)

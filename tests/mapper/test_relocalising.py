@@ -10,7 +10,7 @@ import pytest
 from tests.mapping_rig import errors_m, localise_simulated, map_simulated
 from tests.synthetic_world import World, drive
 
-from engram.localiser import LocalisationStatus
+from engram.localiser.localisation import LocalisationStatus
 
 ROAD = World(length_m=120.0, seed=11)
 ELSEWHERE = World(length_m=60.0, seed=12)

@@ -9,8 +9,8 @@ import pytest
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
-from engram.localiser import Position
-from engram.maps import open_map
+from engram.localiser.localisation import Position
+from engram.maps.map import open_map
 
 ROAD = np.arange(0.0, 40.0, 0.7)
 

@@ -9,13 +9,14 @@ import pytest
 from tests.synthetic_world import World, drive
 
 from engram.frontend.matching import Match
-from engram.geometry import SE3, CameraId
+from engram.geometry.cameras import CameraId
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
-from engram.localiser import Position
 from engram.localiser.attempts import Candidate, Outcome
-from engram.mapper.votes import EdgeVotes, VoteConfig
-from engram.maps import open_map
+from engram.localiser.localisation import Position
+from engram.mapper.mapper import EdgeVotes, VoteConfig
+from engram.maps.map import open_map
 
 SURE = 1e-4 * np.eye(6)
 NOTHING = np.zeros(0, np.int32)

@@ -11,16 +11,22 @@ import pytest
 from tests.mapping_rig import map_simulated, session_for
 from tests.synthetic_world import Seen, World, drive
 
-from engram.frontend import Frame, Match
-from engram.frontend.matching import NO_MATCH
-from engram.geometry import SE3
+from engram.frontend.frame import Frame
+from engram.frontend.matching import NO_MATCH, Match
+from engram.geometry.se3 import SE3
 from engram.graph.model import Attempt, NodeId, PathEntry, Session, path_id
-from engram.localiser import FrameMatcher, Localiser, Position, Prediction, Spread
-from engram.mapper import Mapper, Memory, NodeSaver, Saver
-from engram.maps import Map, RevisionWriter
-from engram.robot import Front, Robot, Settings
+from engram.localiser.acceptance import Prediction, Spread
+from engram.localiser.attempts import FrameMatcher
+from engram.localiser.localisation import Position
+from engram.localiser.localiser import Localiser
+from engram.mapper.mapper import Mapper, Memory, NodeSaver, Saver
+from engram.maps.map import Map
+from engram.maps.writer import RevisionWriter
+from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
-from engram.robot.results import summarise
+from engram.robot.robot import Robot
+from engram.robot.settings import Settings
+from engram.robot.starting import summarise
 from engram.viewing.trajectory import chain_trajectory
 
 ROAD = World(length_m=120.0, seed=11)

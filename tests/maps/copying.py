@@ -7,7 +7,8 @@ import signal
 from pathlib import Path
 
 from engram.graph.model import PathId, SessionId, path_id
-from engram.maps import Map, RevisionWriter
+from engram.maps.map import Map
+from engram.maps.writer import RevisionWriter
 
 
 def begin_bulk(store: Map) -> RevisionWriter:

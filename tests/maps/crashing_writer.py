@@ -6,7 +6,7 @@ import sys
 
 from tests.maps.maps import Drive, begin, session
 
-from engram.maps import Map
+from engram.maps.map import Map
 
 
 def say(*words: object) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from engram.frontend import BRIEF, Frame, FrameStatus, Landmarks
-from engram.frontend.quantisation import LandmarkCodes, landmarks_from_codes
-from engram.geometry import StereoCamera
+from engram.frontend.blobs import LandmarkCodes, landmarks_from_codes
+from engram.frontend.frame import BRIEF, Frame, FrameStatus, Landmarks
+from engram.geometry.cameras import StereoCamera
 
 FRONTEND = "f00dfeed0001"
 CAMERA = StereoCamera(

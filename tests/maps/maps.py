@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from engram.frontend import BRIEF, Frame
-from engram.geometry import SE3
+from engram.frontend.frame import BRIEF, Frame
+from engram.geometry.se3 import SE3
 from engram.graph.model import (
     Attempt,
     Clock,
@@ -22,7 +22,8 @@ from engram.graph.model import (
     path_id,
     session_id,
 )
-from engram.maps import Map, RevisionWriter
+from engram.maps.map import Map
+from engram.maps.writer import RevisionWriter
 
 from .frames import CAMERA, FRONTEND, frame
 

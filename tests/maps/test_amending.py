@@ -7,7 +7,8 @@ import pytest
 from engram.errors import ConfigError, InputError
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Amendable, Amendment, Clock
-from engram.maps import Map, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 
 from .maps import begin, session, write_drive
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engram.errors import MapCorruptError
-from engram.graph.attempts import Attempts
+from engram.graph.paths import Attempts
 from engram.maps.attempts import pack, unpack
 
 

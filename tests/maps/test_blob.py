@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engram.errors import InputError, MapCorruptError
-from engram.frontend import BRIEF
 from engram.frontend.blobs import (
     blob_hash,
     content_digest,
@@ -22,7 +21,8 @@ from engram.frontend.blobs import (
     encode_landmarks,
     encode_thumbnail,
 )
-from engram.geometry import StereoCamera
+from engram.frontend.frame import BRIEF
+from engram.geometry.cameras import StereoCamera
 
 from .frames import CAMERA, assert_same_landmarks, landmarks
 

@@ -26,7 +26,8 @@ from engram.errors import (
     StorageFullError,
 )
 from engram.graph.model import path_id
-from engram.maps import Map, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 from engram.maps.rows import sealed
 from engram.maps.schema import edges, nodes, path_entries
 from engram.sqlite import SqliteFile

@@ -12,9 +12,11 @@ import pytest
 from tests.worlds import attempts_of
 
 from engram.errors import FormatVersionError, IncompatibleError
-from engram.frontend import BRIEF, TEBLID
+from engram.frontend.frame import BRIEF, TEBLID
 from engram.graph.model import EdgeKind
-from engram.maps import Map, SessionState, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
+from engram.maps.records import SessionState
 from engram.maps.schema import FORMAT_VERSION
 
 from .data.make_format_6 import OMITTED, write_map

@@ -9,7 +9,7 @@ import pytest
 
 from engram.errors import InputError
 from engram.graph.model import NodeId
-from engram.maps import Map
+from engram.maps.map import Map
 
 from .frames import assert_same_landmarks
 from .maps import begin, session, write_drive

@@ -8,7 +8,9 @@ import pytest
 
 from engram.errors import InputError, RevisionError
 from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, path_id
-from engram.maps import Map, SessionState, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
+from engram.maps.records import SessionState
 
 from .frames import assert_same_landmarks
 from .maps import Drive, assert_same_edges, begin, edge, node_frame, session, write_drive

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from engram.errors import MapLockedError
-from engram.maps import Map, check_file, copy_map
+from engram.maps.map import Map
+from engram.maps.map_files import check_file, copy_map
 
 from .frames import assert_same_landmarks
 from .maps import begin, node, node_frame, session, write_drive

@@ -10,14 +10,13 @@ from tests.fleet.robots import merged, rewritten, robot_map
 from tests.sequences.bag_maker import bag, made
 
 from engram.errors import InputError
-from engram.fleet.download import update
+from engram.fleet.download.updating import update
 from engram.graph.model import Clock
-from engram.maps import Map, check_file
-from engram.robot.anchoring import anchor_map
-from engram.robot.anchors import read_anchors
-from engram.robot.exporting import Exported, export_map
-from engram.robot.goals import add_goal, list_goals, remove_goal
-from engram.sequences.trajectories import read_tum
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
+from engram.robot.anchors import add_goal, anchor_map, list_goals, read_anchors, remove_goal
+from engram.robot.inspecting import Exported, export_map
+from engram.sequences.motion import read_tum
 
 PLACES_M = np.arange(0.0, 20.0, 1.0)
 METRES_PER_DEGREE = 111_320 * np.cos(np.deg2rad(50.0))

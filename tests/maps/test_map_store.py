@@ -11,10 +11,12 @@ from sqlalchemy import insert
 from tests.worlds import attempts_of
 
 from engram.errors import IncompatibleError, InputError, MapError, MapLockedError, RevisionError
-from engram.frontend import BRIEF, TEBLID
-from engram.geometry import StereoCamera
+from engram.frontend.frame import BRIEF, TEBLID
+from engram.geometry.cameras import StereoCamera
 from engram.graph.model import EdgeKind, NodeId, PathEntry, PathEntryKind, path_id
-from engram.maps import Map, SessionState, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
+from engram.maps.records import SessionState
 from engram.maps.rows import sealed
 from engram.maps.schema import hidden
 

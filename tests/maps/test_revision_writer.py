@@ -12,12 +12,15 @@ from sqlalchemy import insert
 from tests.worlds import attempts_of
 
 from engram.errors import IncompatibleError, InputError, RevisionError
-from engram.frontend import BRIEF, TEBLID
+from engram.frontend.frame import BRIEF, TEBLID
 from engram.graph.model import NodeId, Omission, PathEntry, PathEntryKind, node_id, path_id
-from engram.maps import Map, RevisionWriter, SessionState, check_file
 from engram.maps import writer as writer_module
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
+from engram.maps.records import SessionState
 from engram.maps.rows import sealed
 from engram.maps.schema import hidden
+from engram.maps.writer import RevisionWriter
 
 from .copying import begin_bulk, copy_into
 from .frames import CAMERA, FRONTEND, assert_same_landmarks

@@ -19,7 +19,10 @@ from hypothesis.stateful import (
 
 from engram.errors import RevisionError
 from engram.graph.model import EdgeKind
-from engram.maps import Map, RevisionWriter, SessionState, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
+from engram.maps.records import SessionState
+from engram.maps.writer import RevisionWriter
 
 from .frames import assert_same_landmarks
 from .maps import Drive, assert_same_edges, begin, edge, session

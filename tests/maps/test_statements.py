@@ -5,7 +5,7 @@ from pathlib import Path
 from sqlalchemy.util import LRUCache
 
 from engram import sqlite
-from engram.maps import Map
+from engram.maps.map import Map
 
 from .maps import begin, session, write_drive
 

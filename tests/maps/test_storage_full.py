@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from engram.maps import Map, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 
 from .maps import node, session
 
@@ -16,7 +17,7 @@ from .maps import node, session
 WRITER = """
 import resource, sys
 from engram.errors import StorageFullError
-from engram.maps import Map
+from engram.maps.map import Map
 from tests.maps.maps import Drive, begin, session
 
 store = Map.create(sys.argv[1])

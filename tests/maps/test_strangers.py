@@ -10,7 +10,8 @@ import pytest
 from sqlalchemy import Table
 
 from engram.errors import EngramError, MapCorruptError
-from engram.maps import Map, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 from engram.maps.rows import sealed
 from engram.maps.schema import (
     attempts,

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from engram.errors import MapCorruptError
-from engram.maps import Map, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 
 
 def put(path: Path, body: bytes) -> int:

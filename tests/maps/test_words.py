@@ -11,8 +11,9 @@ from tests.maps.maps import begin, session, write_drive
 
 from engram.errors import InputError, MapCorruptError
 from engram.graph.model import NodeId
-from engram.maps import Map, check_file
-from engram.maps.words import decode_words, encode_words
+from engram.maps.attempts import decode_words, encode_words
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 
 ONE, OTHER = b"1" * 16, b"2" * 16
 RISING = st.sets(st.integers(0, 65535), max_size=600).map(sorted)

@@ -6,7 +6,8 @@ import shutil
 
 import pytest
 
-from engram.maps import Map, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 
 from .maps import begin, session, write_drive
 

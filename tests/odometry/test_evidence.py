@@ -7,15 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from engram.geometry import SE3
-from engram.odometry import (
-    GapFiller,
-    Motion,
-    OdometryStatus,
-    OdometryStep,
-    OutsideModel,
-    OutsideMotion,
-)
+from engram.geometry.se3 import SE3
+from engram.odometry.motion import GapFiller, Motion
+from engram.odometry.outside import OutsideModel, OutsideMotion
+from engram.odometry.step import OdometryStatus, OdometryStep
 
 STEP_S = 0.1
 FIRST = OdometryStep(OdometryStatus.FIRST)

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from tests.reference import kept
 
-from engram.frontend import Frontend, StereoPair
-from engram.geometry import SE3
-from engram.odometry import FixedConfig, FixedPixels, Odometry, OutsideModel, OutsideMotion
-from engram.odometry.fixed import kept_rows
+from engram.frontend.frame import StereoPair
+from engram.frontend.frontend import Frontend
+from engram.geometry.se3 import SE3
+from engram.odometry.fixed import FixedConfig, FixedPixels, kept_rows
+from engram.odometry.odometry import Odometry
+from engram.odometry.outside import OutsideModel, OutsideMotion
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.studies.faults.injected import (
     FixedPattern,

@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from engram.frontend import StereoPair
-from engram.geometry import SE3
-from engram.odometry import FrozenConfig, OutsideMotion
-from engram.odometry.frozen import Repeats, StandsStill, rests
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
+from engram.odometry.outside import FrozenConfig, OutsideMotion, Repeats, StandsStill, rests
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.studies.faults.injected import brightened, halved, on_both, written
 

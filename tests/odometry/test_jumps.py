@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from engram.geometry import SE3
-from engram.odometry import GapFiller, OdometryStatus, OdometryStep
-from engram.odometry.guess import Guess
-from engram.odometry.jumps import Jumps
+from engram.geometry.se3 import SE3
+from engram.odometry.motion import GapFiller, Jumps
+from engram.odometry.step import Guess, OdometryStatus, OdometryStep
 
 STEP = OdometryStep(
     OdometryStatus.OK, SE3(np.eye(3), np.array([0.0, 0.0, 0.7])), np.eye(6) * 1e-4, 200

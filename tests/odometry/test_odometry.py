@@ -7,9 +7,12 @@ import pytest
 from tests.scenes import CAMERA, Scene, normalised_error
 
 from engram.errors import ConfigError, IncompatibleError
-from engram.frontend import TEBLID, Frame, FrameStatus, MatcherConfig
-from engram.geometry import SE3, StereoCamera
-from engram.odometry import Odometry, OdometryConfig, OdometryStatus, WindowConfig
+from engram.frontend.frame import TEBLID, Frame, FrameStatus
+from engram.frontend.matching import MatcherConfig
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+from engram.odometry.odometry import Odometry, OdometryConfig, WindowConfig
+from engram.odometry.step import OdometryStatus
 
 MOTION = SE3.exp([0.03, 0.0, 0.4, 0.0, 0.015, 0.002])
 INTERVAL_NS = 100_000_000

@@ -5,15 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from engram.geometry import SE3
-from engram.odometry import (
-    GapFiller,
-    OdometryStatus,
-    OdometryStep,
-    OutsideConfig,
-    OutsideModel,
-    OutsideMotion,
-)
+from engram.geometry.se3 import SE3
+from engram.odometry.motion import GapFiller
+from engram.odometry.outside import OutsideConfig, OutsideModel, OutsideMotion
+from engram.odometry.step import OdometryStatus, OdometryStep
 
 STEP_M, STEP_S = 1.0, 0.1
 COVARIANCE = np.diag([1e-4] * 3 + [1e-6] * 3)

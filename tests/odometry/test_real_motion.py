@@ -5,10 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.frontend import Frame, Frontend, MatcherConfig, match_frames
-from engram.geometry import SE3
-from engram.odometry import Odometry
-from engram.sequences import open_drive
+from engram.frontend.frame import Frame
+from engram.frontend.frontend import Frontend
+from engram.frontend.matching import MatcherConfig, match_frames
+from engram.geometry.se3 import SE3
+from engram.odometry.odometry import Odometry
+from engram.sequences.opening import open_drive
 
 pytestmark = pytest.mark.data
 

@@ -12,10 +12,10 @@ from tests.instruction_sets import printed
 from tests.odometry.test_odometry import INTERVAL_NS, drive, unusable
 from tests.reference.odometry import Odometry as Twin
 
-from engram.frontend import Frame
-from engram.geometry import SE3
-from engram.odometry import Odometry, OdometryConfig, OdometryStep, WindowConfig
-from engram.odometry.outside import Guess
+from engram.frontend.frame import Frame
+from engram.geometry.se3 import SE3
+from engram.odometry.odometry import Odometry, OdometryConfig, WindowConfig
+from engram.odometry.step import Guess, OdometryStep
 
 # Both call the same kernels; what is between them rounds differently, 1e-12 m at most. The
 # optimisation stops by its cost, and may amplify that.

@@ -8,7 +8,7 @@ from tests.reference.bundle_adjustment import adjust, project
 from tests.scenes import CAMERA
 
 from engram import _core
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 
 INTRINSICS = (CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy, CAMERA.baseline_m)
 SCALE = 11.34

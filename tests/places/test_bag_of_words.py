@@ -3,7 +3,7 @@
 import numpy as np
 from tests.places.worlds import small_vocabulary
 
-from engram.places import BagOfWords
+from engram.places.recognisers import BagOfWords
 
 VOCABULARY = small_vocabulary()
 

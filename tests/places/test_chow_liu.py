@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import entropy
 
-from engram.places import chow_liu
-from engram.places.chow_liu import learn_statistics, mutual_information
+from engram.places import vocabulary
+from engram.places.vocabulary import learn_statistics, mutual_information
 
 
 def drawn_images(seed: int, words: int = 14, count: int = 40) -> list[np.ndarray]:
@@ -63,7 +63,7 @@ def test_the_tree_has_the_greatest_information_of_all_trees(seed: int) -> None:
 def test_blocks_make_no_difference(monkeypatch) -> None:
     images = drawn_images(3)
     whole = learn_statistics(images, 14)
-    monkeypatch.setattr(chow_liu, "_BLOCK", 4)
+    monkeypatch.setattr(vocabulary, "_BLOCK", 4)
     assert np.array_equal(whole.parents, learn_statistics(images, 14).parents)
 
 

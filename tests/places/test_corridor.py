@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from engram import _core
-from engram.frontend import BRIEF
-from engram.places import FabMap, default_vocabulary
+from engram.frontend.frame import BRIEF
+from engram.places.recognisers import FabMap
+from engram.places.vocabulary import default_vocabulary
 
 pytestmark = pytest.mark.data
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from tests.places.worlds import look, places, small_vocabulary
 from tests.reference.fabmap import log_likelihood
 
-from engram.frontend import BRIEF
-from engram.places import DetectorModel, FabMap, FabMapConfig
+from engram.frontend.frame import BRIEF
+from engram.places.recognisers import DetectorModel, FabMap, FabMapConfig
 
 VOCABULARY = small_vocabulary()
 

@@ -7,10 +7,12 @@ import pytest
 from tests.core.textures import shifted_pair
 
 from engram.errors import IncompatibleError
-from engram.frontend import BRIEF, Frame, Frontend, FrontendConfig, StereoPair
 from engram.frontend.features import NET
-from engram.geometry import StereoCamera
-from engram.places import ReadsFrames, Signatures, default_vocabulary
+from engram.frontend.frame import BRIEF, Frame, StereoPair
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.geometry.cameras import StereoCamera
+from engram.places.recognisers import ReadsFrames, Signatures
+from engram.places.vocabulary import default_vocabulary
 
 CAMERA = StereoCamera(260.0, 260.0, 160.0, 120.0, 0.2, 320, 240)
 VOCABULARY = default_vocabulary(NET)

@@ -8,7 +8,7 @@ from tests.instruction_sets import printed
 
 from engram import _core
 from engram.errors import InputError
-from engram.places.tree import TreeArrays, grow_tree
+from engram.places.vocabulary import TreeArrays, grow_tree
 
 
 def clustered(seed: int, groups: int = 12, members: int = 50) -> tuple[np.ndarray, np.ndarray]:

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from tests.places.worlds import THINGS, appearances, look, small_vocabulary
 
 from engram.errors import ConfigError, IncompatibleError, InputError, MapCorruptError
-from engram.frontend import BRIEF, TEBLID
-from engram.places import (
+from engram.frontend.frame import BRIEF, TEBLID
+from engram.places.vocabulary import (
     TrainingConfig,
     decode_vocabulary,
     encode_vocabulary,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from engram.frontend import BRIEF
-from engram.places import TrainingConfig, Vocabulary, train_vocabulary
+from engram.frontend.frame import BRIEF
+from engram.places.vocabulary import TrainingConfig, Vocabulary, train_vocabulary
 
 THINGS = 60
 

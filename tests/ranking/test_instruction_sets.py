@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 from tests.instruction_sets import printed
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.neighbourhood import Search
-from engram.ranking.path import PathPolicy
+from engram.ranking.policies import PathPolicy
 from engram.ranking.recall import RecallPolicy
 from engram_lab.bench.synthetic import SyntheticPlace
 

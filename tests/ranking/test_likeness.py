@@ -8,13 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import MapCorruptError
-from engram.frontend import BRIEF, Frame
+from engram.frontend.frame import BRIEF, Frame
 from engram.graph.model import NodeId
-from engram.places import default_vocabulary
+from engram.places.vocabulary import default_vocabulary
 from engram.places.words import NodeWords
-from engram.ranking.likeness import likenesses, standard_likenesses
-from engram.ranking.recall import RECALL, RecallPolicy
-from engram.testing.situations import MadeUpWords, flat_graph, make_context
+from engram.ranking.recall import RECALL, RecallPolicy, likenesses, standard_likenesses
+from engram.testing.contracts import MadeUpWords, flat_graph, make_context
 
 WORDS = st.lists(st.integers(0, 49), max_size=12, unique=True)
 

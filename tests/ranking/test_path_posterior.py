@@ -10,9 +10,8 @@ from tests.reference.path_posterior import posterior, prior_of, theta_row
 
 from engram.graph.model import PathEntry, PathEntryKind
 from engram.graph.paths import PathMemory
-from engram.ranking.path import PathPolicy
-from engram.ranking.path_near import PathNearPolicy
-from engram.testing.situations import (
+from engram.ranking.policies import PathNearPolicy, PathPolicy
+from engram.testing.contracts import (
     flat_graph,
     make_context,
     memory_of,

@@ -9,11 +9,9 @@ from hypothesis import strategies as st
 
 from engram.errors import ConfigError
 from engram.graph.basin import BASIN_LEVEL
-from engram.ranking import Foreseen, policy_named, policy_names
-from engram.ranking.context import order_by
-from engram.ranking.path import PathPolicy
-from engram.testing import check_policy, unmet
-from engram.testing.situations import make_context, random_context
+from engram.ranking.context import Foreseen, order_by
+from engram.ranking.policies import PathPolicy, policy_named, policy_names
+from engram.testing.contracts import check_policy, make_context, random_context, unmet
 
 contexts = st.integers(0, 2**32).map(random_context)
 

@@ -10,15 +10,13 @@ from tests.reference import recall as reference
 from tests.worlds import forward, make_edge
 
 from engram import _core
-from engram.graph.attempts import Attempts
 from engram.graph.basin import prior_basin_m
 from engram.graph.model import PathEntry, PathEntryKind, path_id
-from engram.graph.paths import PathMemory
-from engram.ranking import Lessons
-from engram.ranking.lessons import UNKNOWN_BASE
+from engram.graph.paths import Attempts, PathMemory
+from engram.ranking.context import UNKNOWN_BASE, Lessons
 from engram.ranking.recall import RECALL, RecallPolicy
-from engram.ranking.run import RunLog
-from engram.testing.situations import (
+from engram.ranking.recent import RunLog
+from engram.testing.contracts import (
     flat_graph,
     lessons_of,
     make_context,

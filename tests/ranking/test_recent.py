@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import ConfigError
-from engram.ranking import IterationUnit, Observations, RecentAttempts, RecentConfig, RunLog
+from engram.ranking.recent import IterationUnit, Observations, RecentAttempts, RecentConfig, RunLog
 
 
 def as_dict(observations: Observations) -> dict[int, bool]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
-from engram.geometry import SE3, StereoCamera
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 
 
 def project(camera: StereoCamera, points_in_cam: np.ndarray) -> np.ndarray:

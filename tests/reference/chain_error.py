@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from engram.geometry import SE3, skew
-from engram.graph.chain_error import PivotedError, edge_error_rows
+from engram.geometry.se3 import SE3, skew
+from engram.graph.basin import PivotedError, edge_error_rows
 
 
 def error_of(covariance) -> PivotedError:

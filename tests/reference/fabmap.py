@@ -1,4 +1,4 @@
-"""FAB-MAP's likelihood word by word, as published: the oracle of `engram.places.fabmap`.
+"""FAB-MAP's likelihood word by word, as published: the oracle of `engram.places.recognisers`.
 
 Source: Cummins & Newman, FAB-MAP, IJRR 27(6), 2008, §4. Shares no code with the package.
 """

@@ -5,7 +5,7 @@ import heapq
 import numpy as np
 from tests.reference.chain_error import error_of
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 
 LEVER_M = 10.0

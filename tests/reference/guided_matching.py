@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import Frame, MatcherConfig
-from engram.geometry import SE3
+from engram.frontend.frame import Frame
+from engram.frontend.matching import MatcherConfig
+from engram.geometry.se3 import SE3
 
 
 def windows(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import Landmarks
+from engram.frontend.frame import Landmarks
 
 
 def kept_rows(

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.frontend import Frame, FrameStatus, Match, match_frames
-from engram.geometry import SE3, propagate_covariance
-from engram.odometry import OdometryConfig, OdometryStatus, OdometryStep
-from engram.odometry.outside import Guess
+from engram.frontend.frame import Frame, FrameStatus
+from engram.frontend.matching import Match, match_frames
+from engram.geometry.se3 import SE3, propagate_covariance
+from engram.odometry.odometry import OdometryConfig
+from engram.odometry.step import Guess, OdometryStatus, OdometryStep
 
 _S_PER_NS = 1e-9
 # Steps that determine the usual number of inliers and the usual interval.

@@ -7,13 +7,14 @@ import pytest
 from tests.fleet.robots import merged, robot_map
 from tests.worlds import covariance_of, forward, make_edge
 
-from engram.fleet.download import DownloadOptions, download
-from engram.graph.marks import Removal, Removed
-from engram.graph.model import Edge, EdgeKind
-from engram.maps import Map, check_file
-from engram.repair import RepairConfig, check_geometry, find_wrong_edges
-from engram.repair.crossings import Crossings
-from engram.testing.situations import make_node
+from engram.fleet.download.downloading import download
+from engram.fleet.download.mission import DownloadOptions
+from engram.graph.model import Edge, EdgeKind, Removal, Removed
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
+from engram.repair.finding import Crossings, RepairConfig, find_wrong_edges
+from engram.repair.repairing import check_geometry
+from engram.testing.contracts import make_node
 
 PLACES_M = np.arange(0.0, 30.0, 1.0)
 

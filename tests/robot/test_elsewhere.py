@@ -9,9 +9,9 @@ import numpy as np
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
-from engram.localiser import LocalisationStatus, Position
-from engram.maps import open_map
-from engram.odometry import OdometryStatus, OdometryStep
+from engram.localiser.localisation import LocalisationStatus, Position
+from engram.maps.map import open_map
+from engram.odometry.step import OdometryStatus, OdometryStep
 
 ROAD = np.arange(0.0, 30.0, 0.7)
 

@@ -8,9 +8,10 @@ import pytest
 
 from engram.errors import IncompatibleError, SequenceError
 from engram.monitor import Advancing
-from engram.robot.recording import extract_log
+from engram.robot.mapping import extract_log
 from engram.robot.settings import Settings
-from engram.sequences import FrameLog, open_drive
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.opening import open_drive
 
 PAIRS = 6
 

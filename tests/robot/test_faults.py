@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.geometry import SE3
-from engram.robot import open_drive
+from engram.geometry.se3 import SE3
+from engram.sequences.opening import open_drive
 from engram_lab.checks.stalls import KITTI_06, KITTI_06_TRUTH, Clip, Tally, freezes, stalls
 
 

@@ -12,13 +12,18 @@ import numpy as np
 import pytest
 from tests.sequences.bag_maker import StereoBag, bag, made, rectified_infos
 
-from engram.frontend import Frame
-from engram.live import Command, FrameEvent, LiveOptions, LiveProcess
+from engram.frontend.frame import Frame
+from engram.live.driving import LiveOptions
+from engram.live.process import LiveProcess
+from engram.live.served import Command, FrameEvent
 from engram.localiser.relocalisation import Exhaustive, Suggested
-from engram.robot import RobotOptions, Settings, map_drive, open_drive, open_map, robot_on
-from engram.robot.anchoring import anchor_map
-from engram.robot.fixed import LatestFix
+from engram.maps.map import open_map
+from engram.robot.anchors import LatestFix, anchor_map
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import robot_on
 from engram.sequences.bags.fixes import Fix, read_fixes
+from engram.sequences.opening import open_drive
 
 START_NS = 1_700_000_000_000_000_000
 METRES_PER_DEGREE = 111_320 * float(np.cos(np.deg2rad(50.0)))

@@ -13,21 +13,16 @@ from pathlib import Path
 import pytest
 
 from engram.errors import ConfigError
-from engram.frontend import StereoPair
+from engram.frontend.frame import StereoPair
 from engram.graph.model import path_id
-from engram.mapper import MapperConfig
-from engram.maps import Map
+from engram.mapper.mapper import MapperConfig
+from engram.maps.map import Map, open_map
 from engram.monitor import Advancing, deferred_interrupt
-from engram.robot import (
-    DriveSequence,
-    MapReport,
-    RobotOptions,
-    Settings,
-    check_map,
-    map_drive,
-    open_drive,
-    open_map,
-)
+from engram.robot.inspecting import check_map
+from engram.robot.localisers import DriveSequence
+from engram.robot.mapping import MapReport, map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.there_and_back import ThereAndBack
 

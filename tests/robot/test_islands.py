@@ -9,10 +9,11 @@ import pytest
 
 from engram.cli.frame import anchor
 from engram.cli.options import SettingsGiven
-from engram.maps import open_map
-from engram.robot import RobotOptions, map_drive, open_drive
-from engram.robot.anchoring import anchor_map
-from engram.robot.islands import IslandsConfig, join_islands
+from engram.maps.map import open_map
+from engram.robot.anchors import IslandsConfig, anchor_map, join_islands
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions
+from engram.sequences.opening import open_drive
 
 METRES_PER_DEGREE = 111_320 * float(np.cos(np.deg2rad(50.0)))
 # Nothing looks for a lost robot: each drive is a part of its own.

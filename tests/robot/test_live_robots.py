@@ -12,13 +12,16 @@ import pytest
 from tests.mapping_rig import session_for
 from tests.synthetic_world import Seen, World, drive
 
-from engram.doctor import DoctorConfig
+from engram.doctor.examination import DoctorConfig
 from engram.errors import ConfigError, MapError, MapLockedError, StorageFullError
-from engram.fleet.merge import merge
-from engram.maps import Map, RevisionWriter, check_file, open_map
+from engram.fleet.merge.merging import merge
+from engram.maps.map import Map, open_map
+from engram.maps.map_files import check_file
 from engram.maps.sqlite import SqliteDatabase
-from engram.robot import Robot, Settings
-from engram.robot.saved import SavingState
+from engram.maps.writer import RevisionWriter
+from engram.robot.live import SavingState
+from engram.robot.robot import Robot
+from engram.robot.settings import Settings
 
 WORLD = World(30.0)
 ROAD = np.arange(0.0, 25.0, 0.7)

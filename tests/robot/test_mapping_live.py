@@ -9,9 +9,11 @@ import pytest
 from tests.goldens import through
 from tests.goldens.cases import DRIVE_0001, HAMLET, KITTI_06, ROOM, DrivesMissingError, data
 
-from engram.maps import open_map
-from engram.robot import DriveSequence, RobotOptions, Settings, map_drive, session_of_drive
+from engram.maps.map import open_map
 from engram.robot.live import Owner
+from engram.robot.localisers import DriveSequence, session_of_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_in
 
 

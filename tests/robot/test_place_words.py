@@ -10,14 +10,16 @@ from tests.mapping_rig import localise_simulated, map_simulated
 from tests.synthetic_world import World, drive
 
 from engram.errors import IncompatibleError, InputError
-from engram.frontend import BRIEF, TEBLID
-from engram.maps import Map, open_map
+from engram.frontend.frame import BRIEF, TEBLID
+from engram.maps.map import Map, open_map
 from engram.monitor import Monitor
-from engram.places import TrainingConfig, default_vocabulary, encode_vocabulary
+from engram.places.vocabulary import TrainingConfig, default_vocabulary, encode_vocabulary
 from engram.places.words import NodeWords, vocabulary_of
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
 from engram.robot.localisers import relocaliser_in
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
 from engram.robot.vocabularies import train_map_vocabulary, use_vocabulary
+from engram.sequences.opening import open_drive
 
 ROAD = World(length_m=60.0, seed=11)
 VOCABULARY = default_vocabulary(BRIEF)

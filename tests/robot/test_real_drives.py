@@ -8,18 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.frontend import StereoPair
-from engram.geometry import SE3
-from engram.maps import check_file
-from engram.robot import (
-    RobotOptions,
-    Settings,
-    localise_drive,
-    map_drive,
-    open_drive,
-    open_map,
-    summarise,
-)
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
+from engram.maps.map import open_map
+from engram.maps.map_files import check_file
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import localise_drive, summarise
+from engram.sequences.opening import open_drive
 from engram.viewing.trajectory import chain_trajectory
 from engram_lab.truth import read_kitti_poses
 

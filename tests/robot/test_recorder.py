@@ -12,13 +12,15 @@ from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
 from engram.errors import EngramError, InputError, MapCorruptError
-from engram.localiser import LocalisationStatus
-from engram.maps import open_map
-from engram.robot import Recorder, RecorderConfig, Settings, open_drive
+from engram.localiser.localisation import LocalisationStatus
+from engram.maps.map import open_map
 from engram.robot.front import Front
-from engram.robot.results import localise_drive
-from engram.sequences import FrameLog
-from engram.sequences.framelog import read_decisions, read_images, read_report
+from engram.robot.recorder import Recorder, RecorderConfig
+from engram.robot.settings import Settings
+from engram.robot.starting import localise_drive
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.framelog.writer import read_decisions, read_images, read_report
+from engram.sequences.opening import open_drive
 from engram_lab.bench.data import synthetic_drive
 
 ROAD = np.arange(0.0, 20.0, 0.7)

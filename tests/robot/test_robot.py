@@ -17,20 +17,25 @@ from tests.synthetic_world import World, drive
 import engram
 from engram import _core
 from engram.errors import MapError
-from engram.localiser import (
+from engram.localiser.localisation import (
     Budget,
     Hint,
     Keeper,
     Localisation,
     LocalisationStatus,
-    Localiser,
     Position,
 )
-from engram.maps import open_map
-from engram.odometry import OdometryStatus, OdometryStep
-from engram.robot import Front, Robot, RobotOptions, Settings, map_drive, open_drive, robot_on
+from engram.localiser.localiser import Localiser
+from engram.maps.map import open_map
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
-from engram.sequences import LoggedFrame
+from engram.robot.mapping import map_drive
+from engram.robot.robot import Robot
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import robot_on
+from engram.sequences.opening import open_drive
+from engram.sequences.sequence import LoggedFrame
 
 ROAD = np.arange(0.0, 20.0, 0.7)
 PACKAGE = str(Path(engram.__file__).parent)

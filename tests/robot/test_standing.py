@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.frontend import StereoPair
-from engram.geometry import SE3
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
 from engram.graph.model import Clock, NodeId
-from engram.localiser import Localisation
-from engram.maps import Map, open_map
-from engram.odometry import OutsideMotion
-from engram.robot import map_drive
-from engram.sequences import SequenceInfo
+from engram.localiser.localisation import Localisation
+from engram.maps.map import Map, open_map
+from engram.odometry.outside import OutsideMotion
+from engram.robot.mapping import map_drive
+from engram.sequences.sequence import SequenceInfo
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.studies.faults.injected import (
     FixedPattern,

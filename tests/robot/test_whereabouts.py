@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.model import NodeId
-from engram.localiser import Position
-from engram.robot import Beginning, RobotOptions, map_drive, open_drive, open_map
-from engram.robot.whereabouts import Whereabouts
+from engram.localiser.localisation import Position
+from engram.maps.map import open_map
+from engram.robot.mapping import Beginning, map_drive
+from engram.robot.robot import Whereabouts
+from engram.robot.settings import RobotOptions
+from engram.sequences.opening import open_drive
 
 
 def test_a_first_drive_lies_where_the_committed_frame_will_have_it(

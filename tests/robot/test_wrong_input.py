@@ -16,12 +16,15 @@ from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
 from engram.errors import ConfigError, IncompatibleError, InputError, SequenceError
-from engram.frontend import StereoPair
-from engram.geometry import SE3
-from engram.localiser import Position
-from engram.maps import Map, open_map
-from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep, OutsideMotion
-from engram.robot import Robot, map_drive
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
+from engram.localiser.localisation import Position
+from engram.maps.map import Map, open_map
+from engram.odometry.motion import GapFiller, Motion
+from engram.odometry.outside import OutsideMotion
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.robot.mapping import map_drive
+from engram.robot.robot import Robot
 
 ROAD = np.arange(0.0, 20.0, 0.7)
 LIVE = drive(World(30.0), ROAD, seed=1, start_ns=10**15)

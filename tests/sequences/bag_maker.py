@@ -16,7 +16,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 
 KINDS = ("ros1", "sqlite", "mcap")
 LEFT, RIGHT = "/stereo/left/image_raw", "/stereo/right/image_raw"

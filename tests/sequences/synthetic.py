@@ -11,18 +11,15 @@ import cv2
 import numpy as np
 
 from engram.errors import EngramError
-from engram.frontend import BRIEF, Frame, FrameStatus, Landmarks, StereoPair
-from engram.frontend.quantisation import LandmarkCodes, landmarks_from_codes
-from engram.geometry import SE3, StereoCamera
+from engram.frontend.blobs import LandmarkCodes, landmarks_from_codes
+from engram.frontend.frame import BRIEF, Frame, FrameStatus, Landmarks, StereoPair
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 from engram.graph.model import Clock
-from engram.odometry import OdometryStatus, OdometryStep
-from engram.sequences import (
-    FrameLogHeader,
-    FrameLogWriter,
-    LoggedFrame,
-    SequenceInfo,
-    first_pair_hash,
-)
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.sequences.framelog.file import FrameLogHeader
+from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.sequence import LoggedFrame, SequenceInfo, first_pair_hash
 
 WIDTH, HEIGHT, PAIRS = 48, 32, 6
 PERIOD_NS = 100_000_000

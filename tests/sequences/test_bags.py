@@ -19,10 +19,10 @@ from engram.errors import (
     SequenceError,
 )
 from engram.graph.model import Clock
-from engram.sequences import BagSequence, open_drive
-from engram.sequences.bags import Bag, messages
-from engram.sequences.bags.inspecting import describe_bag
-from engram.sequences.bags.pairing import learnt_tolerance
+from engram.sequences.bags import messages
+from engram.sequences.bags.containers import Bag
+from engram.sequences.bags.sequence import BagSequence, describe_bag, learnt_tolerance
+from engram.sequences.opening import open_drive
 
 from .bag_maker import (
     KINDS,

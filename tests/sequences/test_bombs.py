@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from engram.calibration import read_calibration
+from engram.calibration.formats import read_calibration
 from engram.config import load_toml, read_toml
 from engram.errors import CalibrationError, ConfigError, SequenceError
-from engram.robot import Settings
 from engram.robot.anchors import GivenAnchor, on_grid
+from engram.robot.settings import Settings
 from engram.sequences.images import decoded, header_size
 
 SIDE = 30_000  # 0.9 gigapixels

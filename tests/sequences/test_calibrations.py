@@ -10,17 +10,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engram.calibration import Cameras, calibration_toml, read_calibration
-from engram.calibration.cameras import rectified_cameras
-from engram.calibration.entries import read_yaml
-from engram.calibration.toml import parse_toml
+from engram.calibration.cameras import Cameras, read_yaml, rectified_cameras
+from engram.calibration.formats import read_calibration
+from engram.calibration.toml import calibration_toml, parse_toml
 from engram.errors import CalibrationError, ConfigError
-from engram.frontend import Frontend, StereoPair
-from engram.geometry import SE3
+from engram.frontend.frame import StereoPair
+from engram.frontend.frontend import Frontend
 from engram.geometry.rectification import DistortionModel, RawCamera, RawStereoCalibration
-from engram.sequences import BagSequence, open_drive
-from engram.sequences.bags.inspecting import describe_bag
-from engram.sequences.options import OpenOptions
+from engram.geometry.se3 import SE3
+from engram.sequences.bags.sequence import BagSequence, describe_bag
+from engram.sequences.opening import open_drive
+from engram.sequences.sequence import OpenOptions
 from engram_lab.bench.data import synthetic_drive
 
 from .bag_maker import LEFT, RIGHT, StereoBag, bag, rectified_infos

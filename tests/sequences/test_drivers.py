@@ -15,13 +15,12 @@ import pytest
 import yaml
 
 from engram.errors import CalibrationError, SequenceError
-from engram.frontend import StereoPair
-from engram.geometry import SE3
-from engram.sequences import BagSequence, open_drive
-from engram.sequences.bags import database
-from engram.sequences.bags.bag import Bag
-from engram.sequences.bags.inspecting import describe_bag
-from engram.sequences.bags.records import Record
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
+from engram.sequences.bags import containers
+from engram.sequences.bags.containers import Bag, Record
+from engram.sequences.bags.sequence import BagSequence, describe_bag
+from engram.sequences.opening import open_drive
 from engram_lab.bench.data import synthetic_drive
 
 from .bag_maker import (
@@ -397,14 +396,14 @@ class TestContainers:
         path = self.killed(tmp_path)
         assert_whole(open_drive(path))
         (path / "drive_0.db3-shm").unlink(missing_ok=True)
-        connect = database._connected
+        connect = containers._connected
 
         def read_only(file: Path, mode: str) -> sqlite3.Connection:
             """As SQLite fails where it cannot make its index: root may write anywhere."""
             opened = connect(file, mode)
             return _Refusing(opened) if file.parent == path else opened  # type: ignore[return-value]
 
-        monkeypatch.setattr(database, "_connected", read_only)
+        monkeypatch.setattr(containers, "_connected", read_only)
         assert_whole(open_drive(path))
         assert sorted(one.name for one in path.iterdir()) == ["drive_0.db3", "drive_0.db3-wal"]
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import ConfigError
-from engram.sequences import FrameRange
+from engram.sequences.sequence import FrameRange
 
 parts = st.none() | st.integers(0, 30)
 

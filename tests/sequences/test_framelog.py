@@ -24,10 +24,13 @@ from engram.errors import (
     SequenceError,
     StorageFullError,
 )
-from engram.geometry import SE3, propagate_covariance
+from engram.geometry.se3 import SE3, propagate_covariance
 from engram.graph.model import Clock
-from engram.odometry import OdometryStatus
-from engram.sequences import FrameLog, FrameLogWriter, FrameRange, LoggedFrame, open_drive
+from engram.odometry.step import OdometryStatus
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.opening import open_drive
+from engram.sequences.sequence import FrameRange, LoggedFrame
 
 from .synthetic import (
     PAIRS,

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from engram.errors import SequenceError
-from engram.geometry import SE3
-from engram.sequences import open_drive
-from engram.sequences.bags.inspecting import describe_bag
+from engram.geometry.se3 import SE3
+from engram.sequences.bags.sequence import describe_bag
 from engram.sequences.motion import FORWARD, read_samples
+from engram.sequences.opening import open_drive
 
 from .bag_maker import KINDS, LEFT, RIGHT, bag, made, rectified_infos
 from .synthetic import LAYOUTS, PAIRS, PERIOD_NS, START_NS, camera, picture, stamp_ns

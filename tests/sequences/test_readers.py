@@ -14,21 +14,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from engram.errors import CalibrationError, ConfigError, InputError, SequenceError
-from engram.frontend import StereoPair
+from engram.frontend.frame import StereoPair
 from engram.graph.model import Clock
-from engram.sequences import (
-    SEQUENCES,
-    FrameRange,
-    ImageSequence,
-    OpenOptions,
-    first_pair_hash,
-    open_drive,
-    session_of,
-)
-from engram.sequences.folder import find_folder
 from engram.sequences.images import read_image
-from engram.testing import check_reader, unmet
-from engram.testing.readers import WriteDrive
+from engram.sequences.layouts import ImageSequence, find_folder
+from engram.sequences.opening import SEQUENCES, open_drive
+from engram.sequences.sequence import FrameRange, OpenOptions, first_pair_hash, session_of
+from engram.testing.contracts import WriteDrive, check_reader, unmet
 
 from .synthetic import (
     HEIGHT,

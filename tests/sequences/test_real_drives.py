@@ -8,17 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from engram.frontend import Frontend
+from engram.frontend.frontend import Frontend
 from engram.graph.model import Clock
-from engram.odometry import Odometry
-from engram.sequences import (
-    FrameLogHeader,
-    FrameLogWriter,
-    LoggedFrame,
-    first_pair_hash,
-    open_drive,
-    session_of,
-)
+from engram.odometry.odometry import Odometry
+from engram.sequences.framelog.file import FrameLogHeader
+from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.opening import open_drive
+from engram.sequences.sequence import LoggedFrame, first_pair_hash, session_of
 
 from .bag_maker import StereoBag, kalibr_chain, rectified_infos
 

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from engram.errors import CalibrationError, SequenceError
-from engram.frontend import StereoPair
+from engram.frontend.frame import StereoPair
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Clock
-from engram.sequences import ImageSequence, open_drive, session_of
+from engram.sequences.layouts import ImageSequence
+from engram.sequences.opening import open_drive
+from engram.sequences.sequence import session_of
 
 from .synthetic import HEIGHT, WIDTH, camera, picture, write_image
 

@@ -10,12 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import InputError, SequenceError
-from engram.geometry import SE3
-from engram.sequences.trajectories import (
-    Trajectory,
-    read_tum,
-    write_tum,
-)
+from engram.geometry.se3 import SE3
+from engram.sequences.motion import Trajectory, read_tum, write_tum
 
 from .synthetic import only_engram_errors
 

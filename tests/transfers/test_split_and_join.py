@@ -7,9 +7,17 @@ import pytest
 from tests.fleet.robots import robot_map
 
 from engram.errors import InputError, MapCorruptError
-from engram.maps import Map, check_file
-from engram.transfers import MissingPartError, Unbundler, bundle, join, split
-from engram.transfers.manifest import decode_manifest, encode_manifest
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
+from engram.transfers import (
+    MissingPartError,
+    Unbundler,
+    bundle,
+    decode_manifest,
+    encode_manifest,
+    join,
+    split,
+)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from engram.viewing import match_picture
+from engram.viewing.pictures import match_picture
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from engram.cli.app import app
 from engram.errors import InputError, MissingExtraError
-from engram.robot import map_drive, open_drive
+from engram.robot.mapping import map_drive
+from engram.sequences.opening import open_drive
 from engram.viewing.viewer import Viewer, viewer_for
 
 

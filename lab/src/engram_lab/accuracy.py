@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 
 # A success with a greater error is a false one. Source: method §8.
 FALSE_BEYOND_M = 1.0

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.places.fabmap import FabMapConfig
-from engram.places.observation import ObservationModel
+from engram.places.recognisers import FabMapConfig, ObservationModel
 from engram.places.vocabulary import Vocabulary
 
 

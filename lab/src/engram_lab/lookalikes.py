@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.frontend import BRIEF
+from engram.frontend.frame import BRIEF
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import NodeId
-from engram.maps import Map, open_map
+from engram.maps.map import Map, open_map
 from engram.monitor import QUIET, Monitor
-from engram.places import BagOfWords
+from engram.places.recognisers import BagOfWords
 from engram.places.words import vocabulary_or_default, words_of
 
 # Edges are about a metre long; what is within so many of them may well look alike.

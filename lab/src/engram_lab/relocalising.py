@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from engram.graph.model import NodeId
-from engram.localiser import Budget, Localisation, Relocaliser
-from engram.maps import open_map
+from engram.localiser.localisation import Budget, Localisation
+from engram.localiser.relocalisation import Relocaliser
+from engram.maps.map import open_map
 from engram.monitor import QUIET, Monitor
-from engram.robot import Front, Robot, arriving
-from engram.robot.localisers import localiser_in, relocaliser_in
-from engram.robot.session import DriveSequence
+from engram.robot.front import Front, arriving
+from engram.robot.localisers import DriveSequence, localiser_in, relocaliser_in
+from engram.robot.robot import Robot
 from engram.robot.settings import Settings
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from engram.frontend import BRIEF, FrameStatus
-from engram.frontend.blobs import encode_landmarks
-from engram.frontend.quantisation import landmarks_from_codes, pixel_quantum, quantise
-from engram.geometry import StereoCamera
+from engram.frontend.blobs import encode_landmarks, landmarks_from_codes, pixel_quantum, quantise
+from engram.frontend.frame import BRIEF, FrameStatus
+from engram.geometry.cameras import StereoCamera
 from engram.graph.model import Clock, Node, Session, node_id, session_id
-from engram.maps import StoredNode
+from engram.maps.records import StoredNode
 
 CAMERA = StereoCamera(400.0, 400.0, 320.0, 240.0, 0.3, 640, 480)
 DESCRIPTOR, FRONTEND = BRIEF, "synthetic"

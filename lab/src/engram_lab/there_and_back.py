@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Iterator
 
 from engram.errors import ConfigError, SequenceError
-from engram.frontend import StereoPair
-from engram.geometry import StereoCamera
-from engram.sequences import SequenceInfo, StereoSequence
+from engram.frontend.frame import StereoPair
+from engram.geometry.cameras import StereoCamera
+from engram.sequences.sequence import SequenceInfo, StereoSequence
 
 
 class ThereAndBack:

@@ -21,18 +21,13 @@ from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.merge.gate import check_held_out
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, Session
-from engram.localiser import Localisation, Position
-from engram.maps import Map, open_map
+from engram.localiser.localisation import Localisation, Position
+from engram.maps.map import Map, open_map
 from engram.measures import Drive, failure, longest_gap_m, route_m, route_not_localised
 from engram.monitor import QUIET, Monitor
-from engram.robot import (
-    DriveSequence,
-    RobotOptions,
-    Settings,
-    measured,
-    robot_on,
-    session_of_drive,
-)
+from engram.robot.localisers import DriveSequence, session_of_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import measured, robot_on
 
 OpenDrive = Callable[[], DriveSequence]
 # Stages that are the robot's own business, whatever map it has.

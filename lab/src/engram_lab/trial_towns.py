@@ -7,14 +7,13 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from engram.frontend import BRIEF
-from engram.localiser import METHOD_VERSION
+from engram.frontend.frame import BRIEF
+from engram.localiser.settings import METHOD_VERSION
 from engram.monitor import QUIET, Monitor
-from engram.robot import Settings
+from engram.robot.settings import Settings
 from engram_lab.misplaced import Street
 from engram_lab.studies.drives import EvaluatedDrive, campaign_logs, drives_of
-from engram_lab.town import Campaign, campaign_named
-from engram_lab.town.campaigns import SessionPlan
+from engram_lab.town.campaigns import Campaign, SessionPlan, campaign_named
 from engram_lab.town.simulating import campaign_folder, campaigns_folder, simulate
 
 FITTED_TOWNS = (301, 302)

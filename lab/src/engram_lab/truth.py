@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError, SequenceError
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.sequences.listing import nanoseconds
-from engram.sequences.trajectories import (
+from engram.sequences.motion import (
     Trajectory,
     finite,
     known_stamp,

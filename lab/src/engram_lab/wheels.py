@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.geometry import SE3
-from engram.odometry import OutsideMotion
+from engram.geometry.se3 import SE3
+from engram.odometry.outside import OutsideMotion
 
 # Wheels measure too much and scatter, as shares; the gyroscope has a bias and noise.
 SCALE, SCATTER = 1.02, 0.01

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 
 from engram.errors import ConfigError
-from engram.frontend import Frontend
-from engram.odometry import Odometry
-from engram.places import FabMap
-from engram.ranking import policy_named
-from engram_lab.bench import STAGES, BenchReport, run_bench, runner
+from engram.frontend.frontend import Frontend
+from engram.odometry.odometry import Odometry
+from engram.places.recognisers import FabMap
+from engram.ranking.policies import policy_named
+from engram_lab.bench import runner
 from engram_lab.bench.data import BenchData, load_bench_data, scale_and_crop, synthetic_drive
 from engram_lab.bench.places import made_up_vocabulary
 from engram_lab.bench.plain import load_plain_pipeline
 from engram_lab.bench.ranking import PlainFormula
-from engram_lab.bench.report import Machine, Side, StageResult
-from engram_lab.bench.stages import prepare_attempt, prepare_frontend_odometry
+from engram_lab.bench.report import BenchReport, Machine, Side, StageResult
+from engram_lab.bench.runner import run_bench
+from engram_lab.bench.stages import STAGES, prepare_attempt, prepare_frontend_odometry
 from engram_lab.bench.synthetic import SyntheticPlace
 from engram_lab.dense import DenseTable
 

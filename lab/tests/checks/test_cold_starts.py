@@ -11,7 +11,7 @@ from lab.tests.evaluation.campaigns import write_campaign
 
 from engram.monitor import QUIET
 from engram_lab.checks import cold_starts
-from engram_lab.studies import DriveSet, split
+from engram_lab.studies.drives import DriveSet, split
 
 # The road of 24 m; the drives that fold 0 holds out are one of a look that the map knows, and one
 # of a look that it does not.

@@ -13,7 +13,7 @@ from engram_lab.checks.dreams import HANDED_IN, HELD_OUT, VALIDATION, made_once
 from engram_lab.checks.dreams import told as told_of_held_out
 from engram_lab.checks.lenses import told
 from engram_lab.checks.mountings import MOUNTED, MountedSequence
-from engram_lab.town.sequence import SimulatedSequence
+from engram_lab.town.session import SimulatedSequence
 from engram_lab.town.simulating import campaign_folder
 from engram_lab.trial_towns import longer_trial_town, trial_town
 

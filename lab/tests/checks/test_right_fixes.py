@@ -3,7 +3,7 @@
 import pytest
 
 from engram.errors import ConfigError
-from engram.frontend import BRIEF
+from engram.frontend.frame import BRIEF
 from engram_lab.checks.right_fixes import live_settings
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.geometry import SE3
-from engram.localiser import Position
-from engram.maps import Map
+from engram.geometry.se3 import SE3
+from engram.localiser.localisation import Position
+from engram.maps.map import Map
 from engram_lab.checks import soak
 
 

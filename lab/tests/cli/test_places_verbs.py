@@ -49,7 +49,7 @@ def test_lanes_and_threads_are_as_the_settings_say(
 
 
 def test_an_empty_map_is_a_new_place_everywhere(engram, street: Path, tmp_path: Path) -> None:
-    from engram.maps import Map
+    from engram.maps.map import Map
 
     Map.create(tmp_path / "empty.engram").close()
     summary = engram("lab", "relocalise", tmp_path / "empty.engram", street, "--json").json[
@@ -60,7 +60,7 @@ def test_an_empty_map_is_a_new_place_everywhere(engram, street: Path, tmp_path: 
 
 
 def test_an_empty_map_has_no_places_that_look_alike(engram, tmp_path: Path) -> None:
-    from engram.maps import Map
+    from engram.maps.map import Map
 
     Map.create(tmp_path / "empty.engram").close()
     ran = engram("lab", "places", tmp_path / "empty.engram")

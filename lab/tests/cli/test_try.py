@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 from tests.cli.conftest import engram
 
-from engram.robot import RobotOptions, Settings, extract_log, map_drive, open_drive
+from engram.robot.mapping import extract_log, map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 
 __all__ = ["engram"]
 

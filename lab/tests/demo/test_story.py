@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from engram_lab.demo import run_demo
+from engram_lab.demo.story import run_demo
 
 
 @pytest.mark.long

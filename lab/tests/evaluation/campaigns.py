@@ -8,11 +8,13 @@ import numpy as np
 from tests.synthetic_world import World, drive
 
 from engram.graph.model import Clock
-from engram.robot import RobotOptions
-from engram.sequences import FrameLogHeader, FrameLogWriter, LoggedFrame
-from engram.sequences.sequence import SequenceInfo
-from engram.sequences.trajectories import Trajectory, write_tum
-from engram_lab.studies import DriveSet, RankingOptions, drives_of
+from engram.robot.settings import RobotOptions
+from engram.sequences.framelog.file import FrameLogHeader
+from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.motion import Trajectory, write_tum
+from engram.sequences.sequence import LoggedFrame, SequenceInfo
+from engram_lab.studies.drives import DriveSet, drives_of
+from engram_lab.studies.running import RankingOptions
 from engram_lab.truth import truth_path
 
 WORLD = World(24.0)

@@ -7,11 +7,11 @@ import pytest
 from lab.tests.evaluation.campaigns import few_options, write_campaign
 
 from engram.graph.graph import ExperienceGraph
-from engram.robot import RobotOptions, Settings, open_map
-from engram_lab.studies import DriveSet
+from engram.maps.map import open_map
+from engram.robot.settings import RobotOptions, Settings
 from engram_lab.studies.building import build_map, true_nodes
 from engram_lab.studies.configurations import EVERYTHING, UNLIMITED, sweep
-from engram_lab.studies.starting import TrueNodes
+from engram_lab.studies.drives import DriveSet, TrueNodes
 
 OPTIONS: RobotOptions = few_options().build
 

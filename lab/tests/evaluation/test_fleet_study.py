@@ -11,25 +11,22 @@ import pytest
 from lab.tests.evaluation.campaigns import write_campaign
 
 from engram.errors import ConfigError, InputError
-from engram.maps import Map, open_map
+from engram.maps.map import Map, open_map
 from engram.monitor import QUIET, Monitor
-from engram.robot import RobotOptions, Settings
-from engram_lab.studies import DriveSet
-from engram_lab.studies.fleet import (
+from engram.robot.settings import RobotOptions, Settings
+from engram_lab.studies.drives import DriveSet
+from engram_lab.studies.fleet import steps
+from engram_lab.studies.fleet.experiments import fleet_tasks, pair_merges
+from engram_lab.studies.fleet.plan import (
     FleetOptions,
     FleetPlan,
     Protocol,
-    fleet_tasks,
     make_fleet_plan,
-    stages,
-    steps,
-    trials,
-    write_fleet_report,
+    read_download,
 )
-from engram_lab.studies.fleet.experiments import pair_merges
-from engram_lab.studies.fleet.records import read_download
+from engram_lab.studies.fleet.report import write_fleet_report
 from engram_lab.studies.fleet.results import ArmResult
-from engram_lab.studies.tasks import run_tasks
+from engram_lab.studies.plan import run_tasks
 
 pytestmark = pytest.mark.long
 
@@ -150,11 +147,11 @@ def test_the_lost_are_timed_by_what_they_attempt_in_vain(plan: FleetPlan, monkey
     (fold, *_), options = plan.folds, RobotOptions("distance", 1, 8, relocaliser="exhaustive")
     drives = [one.path for one in plan.held_out(fold)]
     about = drives, steps.map_path(plan, plan.arms[0], fold, "single"), plan.settings, options
-    assert stages.medians(*about)["proposed_ms"] > 0
+    assert steps.medians(*about)["proposed_ms"] > 0
     without = replace(options, relocaliser=None)
-    assert stages.medians(*about[:-1], without)["proposed_ms"] == 0
-    monkeypatch.setattr(stages, "accept_lost", lambda *_: True)
-    assert stages.medians(*about)["proposed_ms"] == 0
+    assert steps.medians(*about[:-1], without)["proposed_ms"] == 0
+    monkeypatch.setattr(steps, "accept_lost", lambda *_: True)
+    assert steps.medians(*about)["proposed_ms"] == 0
 
 
 def test_times_are_counts_times_medians(plan: FleetPlan) -> None:
@@ -350,17 +347,17 @@ def test_where_one_download_finds_nothing_the_others_are_tried(
     other, (arm,), fold = replace(plan, work=tmp_path), plan.arms, plan.folds[0]
     shutil.copytree(plan.folder(arm, fold), other.folder(arm, fold))
     drive = plan.held_out(fold)[0]
-    trials.trials_path(other, arm, fold, drive).unlink()
-    tried = trials.try_downloads
+    steps.trials_path(other, arm, fold, drive).unlink()
+    tried = steps.try_downloads
 
     def none_by_hour(centre, wanted, **options):
         if "tod+paths" in wanted:
             raise InputError("no epoch has data")
         return tried(centre, wanted, **options)
 
-    monkeypatch.setattr(trials, "try_downloads", none_by_hour)
-    trials.try_downloads_for(other, arm, fold, "shared", drive)
-    kept = json.loads(trials.trials_path(other, arm, fold, drive).read_text())
+    monkeypatch.setattr(steps, "try_downloads", none_by_hour)
+    steps.try_downloads_for(other, arm, fold, "shared", drive)
+    kept = json.loads(steps.trials_path(other, arm, fold, drive).read_text())
     assert kept["refused"]["tod+paths"] == "no epoch has data"
     names = [one["name"] for one in kept["tried"]]
     assert names[:2] == ["copy", "tod"]
@@ -373,15 +370,15 @@ def test_all_downloads_that_are_compared_leave_thumbnails_behind(
     """Else `budget`, which has none, would get more nodes of as many bytes."""
     other, (arm,), fold = without(plan, tmp_path / "work"), plan.arms, plan.folds[0]
     drive = plan.held_out(fold)[0]
-    trials.trials_path(other, arm, fold, drive).unlink()
-    tried, with_thumbnails = trials.try_downloads, {}
+    steps.trials_path(other, arm, fold, drive).unlink()
+    tried, with_thumbnails = steps.try_downloads, {}
 
     def look(centre, wanted, **options):
         with_thumbnails.update({name: one.with_thumbnails for name, one in wanted.items()})
         return tried(centre, wanted, **options)
 
-    monkeypatch.setattr(trials, "try_downloads", look)
-    trials.try_downloads_for(other, arm, fold, "shared", drive)
+    monkeypatch.setattr(steps, "try_downloads", look)
+    steps.try_downloads_for(other, arm, fold, "shared", drive)
     names = {"copy", "tod", "tod+paths", "budget 1/4", "budget 1/10"}
     names |= {"budget as tod", "budget as tod+paths"}
     assert with_thumbnails == dict.fromkeys(names, False)
@@ -390,13 +387,13 @@ def test_all_downloads_that_are_compared_leave_thumbnails_behind(
 def test_trials_of_downloads_with_thumbnails_are_made_anew(plan, tmp_path: Path) -> None:
     other, (arm,), fold = without(plan, tmp_path / "work"), plan.arms, plan.folds[0]
     drive = plan.held_out(fold)[0]
-    path = trials.trials_path(other, arm, fold, drive)
+    path = steps.trials_path(other, arm, fold, drive)
     kept = json.loads(path.read_text())
     del kept["thumbnails"]  # as an earlier version wrote it
     path.write_text(json.dumps(kept))
-    assert not trials.read_trials(other, arm, fold, drive)
-    trials.try_downloads_for(other, arm, fold, "shared", drive)
-    assert trials.read_trials(other, arm, fold, drive)
+    assert not steps.read_trials(other, arm, fold, drive)
+    steps.try_downloads_for(other, arm, fold, "shared", drive)
+    assert steps.read_trials(other, arm, fold, drive)
 
 
 def test_held_out_validation_and_groups_of_the_orders_are_apart(plan: FleetPlan) -> None:

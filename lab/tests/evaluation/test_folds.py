@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from engram.errors import ConfigError
-from engram_lab.studies import split
+from engram_lab.studies.drives import split
 
 
 @given(st.integers(2, 8), st.integers(0, 40), st.integers(0, 5))

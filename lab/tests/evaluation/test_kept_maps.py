@@ -7,8 +7,8 @@ import pytest
 from tests.maps import maps
 
 from engram.errors import MapError
-from engram.maps import open_map
-from engram_lab.studies.kept_maps import KeptMaps
+from engram.maps.map import open_map
+from engram_lab.studies.drives import KeptMaps
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ from tests.synthetic_world import World, drive
 
 from engram.frontend.matching import MatcherConfig
 from engram.graph.model import NodeId, SessionId, node_id
-from engram.localiser import FrameMatcher
-from engram_lab.studies.memo import MatchMemo
+from engram.localiser.attempts import FrameMatcher
+from engram_lab.studies.lockstep import MatchMemo
 
 WORLD = World(20.0)
 CONFIG = MatcherConfig()

@@ -12,25 +12,22 @@ import pytest
 from tests.synthetic_world import CAMERA
 
 from engram.errors import InputError
-from engram.frontend import BRIEF
+from engram.frontend.frame import BRIEF
 from engram.graph.model import Clock, Session, SessionId
-from engram.robot import Settings
+from engram.robot.settings import Settings
 from engram_lab.policies import STUDIED
-from engram_lab.studies import (
-    UNLIMITED,
-    Configuration,
-    DriveSet,
-    EvaluatedDrive,
-    Plan,
-    RankingOptions,
-    make_plan,
+from engram_lab.studies.configurations import UNLIMITED, Configuration, map_sizes, sweep
+from engram_lab.studies.drives import DriveSet, EvaluatedDrive
+from engram_lab.studies.lockstep import Runs, only, read_runs, write_runs
+from engram_lab.studies.ranking_report import (
+    POLICY_COLOURS,
+    draw_figures,
+    labelled,
+    policy_rows,
+    summary_rows,
     write_report,
 )
-from engram_lab.studies.configurations import map_sizes, sweep
-from engram_lab.studies.lockstep import Runs
-from engram_lab.studies.ranking_figures import POLICY_COLOURS, draw_figures
-from engram_lab.studies.ranking_rows import labelled, policy_rows, summary_rows
-from engram_lab.studies.store import only, read_runs, write_runs
+from engram_lab.studies.running import Plan, RankingOptions, make_plan
 from engram_lab.studies.summary import collect
 
 FRAMES = 400

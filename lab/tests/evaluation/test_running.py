@@ -10,23 +10,15 @@ import pytest
 from lab.tests.evaluation.campaigns import few_options, write_campaign
 
 from engram.errors import ConfigError, MapLockedError, SequenceError
-from engram.robot import Settings, open_map
-from engram_lab.studies import (
-    UNLIMITED,
-    Configuration,
-    DriveSet,
-    Plan,
-    building,
-    drives_of,
-    forget,
-    make_plan,
-    open_campaign,
-    run,
-    running,
-    write_report,
-)
-from engram_lab.studies.store import read_runs
-from engram_lab.studies.writing import alone_in
+from engram.maps.map import open_map
+from engram.robot.settings import Settings
+from engram_lab.studies import building, running
+from engram_lab.studies.configurations import UNLIMITED, Configuration
+from engram_lab.studies.drives import DriveSet, drives_of, open_campaign
+from engram_lab.studies.lockstep import read_runs
+from engram_lab.studies.pages import alone_in
+from engram_lab.studies.ranking_report import write_report
+from engram_lab.studies.running import Plan, forget, make_plan, run
 from engram_lab.truth import truth_path
 
 

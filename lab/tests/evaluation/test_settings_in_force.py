@@ -18,42 +18,28 @@ from engram.cli.settings import AllSettings, every_setting, read_settings
 from engram.config import config_hash, from_dict
 from engram.errors import ConfigError
 from engram.graph.paths import MATCHES_ONLY
-from engram.localiser import FrameMatcher, localiser
-from engram.maps import open_map
+from engram.localiser import localiser
+from engram.localiser.attempts import FrameMatcher
+from engram.maps.map import open_map
 from engram.monitor import QUIET
-from engram.ranking import POLICIES
-from engram.robot import RobotOptions, Settings, robot_on
-from engram.sequences import FrameLog
-from engram_lab.studies import (
-    DriveSet,
-    EvaluatedDrive,
-    Fold,
-    Plan,
-    building,
-    make_plan,
-    run,
-    running,
-    write_report,
-)
+from engram.ranking.policies import POLICIES
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import robot_on
+from engram.sequences.framelog.reader import FrameLog
+from engram_lab.studies import building, running
 from engram_lab.studies.configurations import EVERYTHING, Configuration
-from engram_lab.studies.fleet import (
-    FleetOptions,
-    FleetPlan,
-    arms_for,
-    fleet_tasks,
-    make_fleet_plan,
-    orders,
-    steps,
-    trials,
-    write_fleet_report,
-)
-from engram_lab.studies.fleet.plan import VERBS
+from engram_lab.studies.drives import DriveSet, EvaluatedDrive, Fold
+from engram_lab.studies.fleet import steps
+from engram_lab.studies.fleet.experiments import fleet_tasks
+from engram_lab.studies.fleet.plan import VERBS, FleetOptions, FleetPlan, arms_for, make_fleet_plan
+from engram_lab.studies.fleet.report import write_fleet_report
 from engram_lab.studies.fleet.results import ArmResult
-from engram_lab.studies.held_out import localise_held_out
 from engram_lab.studies.in_force import VARIED, by_key, differing, unused
-from engram_lab.studies.memo import MatchMemo
+from engram_lab.studies.lockstep import MatchMemo
+from engram_lab.studies.plan import run_tasks
+from engram_lab.studies.ranking_report import write_report
+from engram_lab.studies.running import Plan, localise_held_out, make_plan, run
 from engram_lab.studies.summary import collect
-from engram_lab.studies.tasks import run_tasks
 
 __all__ = ["engram"]
 PAPERS = ("linegar2015", "gadd2016")
@@ -518,21 +504,21 @@ def test_downloads_and_orders_of_a_fleet_have_every_setting(
     fleet, drives, tmp_path: Path, monkeypatch
 ) -> None:
     sent = given_to(monkeypatch, steps, "download")
-    tried = given_to(monkeypatch, trials, "try_downloads")
-    ordered = given_to(monkeypatch, orders, "find_best_order")
+    tried = given_to(monkeypatch, steps, "try_downloads")
+    ordered = given_to(monkeypatch, steps, "find_best_order")
     for key in of("download", "build", "drive"):
         settings, value = altered(key, EVERY[key])
         plan = replace(make_fleet_plan(drives, settings, FLEET, tmp_path), work=fleet.work)
         (arm,), fold = plan.arms, plan.folds[0]
         drive = plan.held_out(fold)[0]
         own, mission = plan.forays(fold)["r1"]
-        trials.trials_path(plan, arm, fold, drive).unlink(missing_ok=True)
+        steps.trials_path(plan, arm, fold, drive).unlink(missing_ok=True)
         (plan.folder(arm, fold) / "orders.json").unlink(missing_ok=True)
         about = plan, arm, fold
         for step in (
             partial(steps.download_for_foray, *about, "new", "docked", "tod", own, mission),
-            partial(trials.try_downloads_for, *about, "shared", drive),
-            partial(orders.try_orders, *about, ["orders-0", "orders-1"]),
+            partial(steps.try_downloads_for, *about, "shared", drive),
+            partial(steps.try_orders, *about, ["orders-0", "orders-1"]),
         ):
             with pytest.raises(_SeenError):
                 step()

@@ -12,7 +12,7 @@ import pytest
 
 from engram.errors import WorkerError
 from engram.monitor import QUIET
-from engram_lab.studies.tasks import Task, run_tasks
+from engram_lab.studies.plan import Task, run_tasks
 
 
 def _write(path: Path) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from tests.core.textures import texture
 
-from engram.frontend import Landmarks
-from engram.geometry import StereoCamera
+from engram.frontend.frame import Landmarks
+from engram.geometry.cameras import StereoCamera
 from engram_lab.eyes import Patches, same_corners
 
 CAMERA = StereoCamera(300.0, 300.0, 255.5, 191.5, 0.24, 512, 384)

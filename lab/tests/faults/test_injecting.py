@@ -17,10 +17,11 @@ import pytest
 from numpy.typing import NDArray
 
 from engram.errors import ConfigError, MapCorruptError
-from engram.frontend import StereoPair
-from engram.geometry import SE3, StereoCamera
+from engram.frontend.frame import StereoPair
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 from engram.graph.model import NodeId
-from engram.maps import Map
+from engram.maps.map import Map
 from engram_lab.studies.faults.clips import (
     DOCTORED,
     JUDGING,
@@ -44,13 +45,22 @@ from engram_lab.studies.faults.injected import (
     reaching_in,
     undisturbed,
 )
-from engram_lab.studies.faults.mapping import map_on
-from engram_lab.studies.faults.page import page
-from engram_lab.studies.faults.places import Place, damaged, mapped_by
-from engram_lab.studies.faults.real import RealPlan, real_plans
-from engram_lab.studies.faults.staging import KINDS, REVERSE, TURNED, Scene, drawn, turned_round
-from engram_lab.studies.faults.study import run_trial
-from engram_lab.studies.faults.trials import MADE_BY, Trial, TrialFile, read_trials
+from engram_lab.studies.faults.staging import (
+    KINDS,
+    MADE_BY,
+    REVERSE,
+    TURNED,
+    Place,
+    Scene,
+    Trial,
+    TrialFile,
+    damaged,
+    drawn,
+    mapped_by,
+    read_trials,
+    turned_round,
+)
+from engram_lab.studies.faults.study import RealPlan, map_on, page, real_plans, run_trial
 
 CAMERA = StereoCamera(60.0, 60.0, 47.5, 31.5, 0.2, 96, 64)
 

@@ -15,7 +15,7 @@ from engram_lab.fits.calibration import (
     world_hash,
 )
 from engram_lab.town import textures
-from engram_lab.town.visits import VISITS, Places
+from engram_lab.town.rendering import VISITS, Places
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ from uuid import UUID
 import numpy as np
 import pytest
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.model import SessionId
-from engram.odometry import OdometryStatus, OdometryStep
+from engram.odometry.step import OdometryStatus, OdometryStep
 from engram_lab.fits import dead_reckoning
 
 SIGMA_M, FRAMES = 0.01, 30

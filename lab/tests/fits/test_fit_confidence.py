@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from engram.localiser import Spread
+from engram.localiser.acceptance import Spread
 from engram.localiser.confidence import Evidence, Standing
 from engram_lab.fits.confidence import Row, Rows, fitted, judged, judged_lookalikes, logistic
 

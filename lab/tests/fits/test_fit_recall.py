@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from engram.ranking import Foreseen, policy_named
+from engram.ranking.context import Foreseen
+from engram.ranking.policies import policy_named
 from engram.ranking.recall import RECALL
-from engram.testing.situations import make_context
+from engram.testing.contracts import make_context
 from engram_lab.fits import recall
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.fleet.download.forecast import BINS, INTERVALS, Weather
+from engram.fleet.download.coverage import BINS, INTERVALS, Weather
 from engram_lab.fits.forecasts import (
     class_of,
     classes,

@@ -8,8 +8,7 @@ from tests.core.textures import texture
 from tests.reference import patch_network as plain
 
 from engram import _core
-from engram_lab.eyes import Patches
-from engram_lab.eyes.scenes import JUDGED, drawn_visits
+from engram_lab.eyes import JUDGED, Patches, drawn_visits
 
 torch = pytest.importorskip("torch", reason="training needs pip install 'engram-lab[train]'")
 

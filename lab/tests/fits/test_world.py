@@ -11,7 +11,7 @@ from lab.tests.evaluation.campaigns import write_campaign
 from engram.errors import SequenceError
 from engram_lab.fits.world import LAPS, load_clip, measure_laps, month
 from engram_lab.studies.drives import campaign_logs
-from engram_lab.town import Size, campaign_named
+from engram_lab.town.campaigns import Size, campaign_named
 
 
 def test_the_month_is_begbroke_in_small() -> None:

@@ -12,19 +12,17 @@ from pathlib import Path
 import pytest
 from tests.centre.conftest import drive
 
-from engram.agent import enrol
 from engram.agent.agent import MAP
-from engram.centre.access.enrolment import new_code
+from engram.agent.link import enrol
+from engram.centre.access import new_code
 from engram.centre.service import Centre, MapPolicy
 from engram.errors import EngramError
-from engram.fleet.merge import MergeOptions
-from engram.maps import Map, check_file
+from engram.fleet.merge.settings import MergeOptions
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 from engram.monitor import QUIET
-from engram_lab.fleet_day import run_day
-from engram_lab.fleet_day.day import listening
-from engram_lab.fleet_day.proxy import CuttingProxy, cutting
+from engram_lab.fleet_day.day import CuttingProxy, Stages, cutting, listening, run_day
 from engram_lab.fleet_day.robot import DayRobot
-from engram_lab.fleet_day.stages import Stages
 
 COPY = {"select": "copy"}
 
@@ -71,7 +69,7 @@ def test_a_download_that_cannot_be_made_ends_at_once_with_its_reason(
     def refuse(*_: object, **__: object) -> None:
         raise EngramError("no such hour")
 
-    monkeypatch.setattr("engram.centre.downloads.download", refuse)
+    monkeypatch.setattr("engram.centre.jobs.download", refuse)
     robot = town.robot("r1", 1_000)
     robot.hand_in("first")
     with pytest.raises(EngramError, match=r"r1 downloads, copy: .*no such hour"):
@@ -84,7 +82,7 @@ def test_a_hand_in_that_cannot_be_merged_ends_at_once_with_its_reason(
     def refuse(*_: object) -> None:
         raise EngramError("no such thing")
 
-    monkeypatch.setattr("engram.centre.worker.merging.admit", refuse)
+    monkeypatch.setattr("engram.centre.merging.admit", refuse)
     with pytest.raises(EngramError, match=r"the centre merges r1's first foray: no such thing"):
         town.robot("r1", 1_000).hand_in("first")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from engram.errors import InputError
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.measures import FORMULAS, Drive, Estimator, failure, failure_sums, gaps
 from engram_lab.accuracy import pose_errors
 

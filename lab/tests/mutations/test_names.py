@@ -19,7 +19,7 @@ from engram.cli.app import app
 from engram.maps.rows import sealed
 from engram.maps.schema import metadata
 from engram.sequences.framelog.file import log_digest, log_table
-from engram_lab.mutations.samples import make_samples
+from engram_lab.mutations.case import make_samples
 
 # A terminal's title, a cleared screen, text from right to left; markup of bars, formulas of plots.
 WILD = "\x1b]0;owned\x07\x1b[2J\u202e[/red]$\\frac{$"

@@ -7,11 +7,11 @@ import pytest
 
 from engram.errors import ConfigError
 from engram.graph.model import PathEntry, PathEntryKind, path_id
-from engram.ranking import Foreseen, policy_named, policy_names
-from engram.robot import RobotOptions
-from engram.testing.situations import flat_graph, make_context, memory_of, run_of, session_uuid
-from engram_lab.policies.bandit import session_tallies
-from engram_lab.policies.time_of_day import TimeOfDayPolicy
+from engram.ranking.context import Foreseen
+from engram.ranking.policies import policy_named, policy_names
+from engram.robot.settings import RobotOptions
+from engram.testing.contracts import flat_graph, make_context, memory_of, run_of, session_uuid
+from engram_lab.policies import TimeOfDayPolicy, session_tallies
 
 
 def order_of(name: str, context) -> list[int]:

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from engram.geometry import StereoCamera
-from engram_lab.town import Campaign, SimulatedDrive, campaign_named
+from engram.geometry.cameras import StereoCamera
+from engram_lab.town.campaigns import Campaign, campaign_named
+from engram_lab.town.session import SimulatedDrive
 
 
 def small(drive: SimulatedDrive) -> SimulatedDrive:

@@ -5,8 +5,7 @@ import pytest
 
 from engram_lab import _town
 from engram_lab.town.mesh import Kind, Mesh, MeshBuilder, SurfaceFlag
-from engram_lab.town.noise import NoiseFields
-from engram_lab.town.textures import sheet
+from engram_lab.town.textures import NoiseFields, sheet
 
 _CAMERA = _town.RenderCamera(60.0, 60.0, 31.5, 23.5, 64, 48, 0.3)
 # Looking north: columns right (east), down, forward (north).

@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 from lab.tests.simulation.conftest import small
 
 from engram.errors import ConfigError
-from engram_lab.town import Campaign, Kind, SimulatedDrive, Size, campaign_named
 from engram_lab.town.camera_model import Lens
+from engram_lab.town.campaigns import Campaign, Size, campaign_named
+from engram_lab.town.mesh import Kind
+from engram_lab.town.session import SimulatedDrive
 
 
 def test_pairs_have_the_camera_s_size_and_rising_stamps(drive: SimulatedDrive) -> None:
@@ -71,7 +73,8 @@ def test_another_seed_is_another_town(drive: SimulatedDrive) -> None:
 
 _PRINT_CHECKSUM = """
 import sys, numpy as np
-from engram_lab.town import SimulatedDrive, campaign_named
+from engram_lab.town.session import SimulatedDrive
+from engram_lab.town.campaigns import campaign_named
 from lab.tests.simulation.conftest import small
 drive = small(SimulatedDrive(campaign_named("hamlet", seed=3), int(sys.argv[1])))
 np.save(sys.argv[2], next(drive.frames(20, 21)).left)

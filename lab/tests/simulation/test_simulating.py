@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from engram.errors import ConfigError, IncompatibleError, SequenceError, WorkerError
-from engram.frontend import FrontendConfig
+from engram.frontend.frontend import FrontendConfig
 from engram.monitor import Monitor
-from engram.robot import Settings
-from engram.sequences import FrameLog, open_drive, session_of
-from engram.sequences.sequence import first_pair_hash
-from engram_lab.town import Campaign, campaign_named
-from engram_lab.town.sequence import SimulatedSequence
+from engram.robot.settings import Settings
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.opening import open_drive
+from engram.sequences.sequence import first_pair_hash, session_of
+from engram_lab.town.campaigns import Campaign, campaign_named
+from engram_lab.town.session import SimulatedSequence
 from engram_lab.town.simulating import campaign_folder, simulate
 from engram_lab.truth import read_kitti_poses, read_truth
 

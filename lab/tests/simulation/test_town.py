@@ -8,14 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from engram.errors import ConfigError
-from engram_lab.town.buildings import wall_pieces
-from engram_lab.town.changes import AlterationKind, alterations_on
-from engram_lab.town.conditions import WEATHERS, Conditions
+from engram_lab.town.conditions import WEATHERS, Conditions, sun_direction
 from engram_lab.town.drive import driving_line
-from engram_lab.town.noise import NoiseFields
-from engram_lab.town.sky import sun_direction
-from engram_lab.town.streets import Fronts, Unique, crossing_loops, equal_rings, loop_of_length
-from engram_lab.town.textures import Style, facade
+from engram_lab.town.furniture import wall_pieces
+from engram_lab.town.streets import (
+    AlterationKind,
+    Fronts,
+    Unique,
+    alterations_on,
+    crossing_loops,
+    equal_rings,
+    loop_of_length,
+)
+from engram_lab.town.textures import NoiseFields, Style, facade
 from engram_lab.town.town import Today, Town, _Side, _slide_m, _TileBuilder
 
 

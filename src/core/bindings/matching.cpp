@@ -155,7 +155,7 @@ nb::list attempt(const Features &live, const std::vector<AttemptArguments> &aske
 
 void bind_matching(nb::module_ &module) {
   nb::class_<MatchSettings>(module, "MatchSettings",
-                            "Settings of matching; see `engram.frontend.MatcherConfig`.")
+                            "Settings of matching; see `engram.frontend.matching.MatcherConfig`.")
       .def(nb::init<>())
       .def_rw("max_distance", &MatchSettings::max_distance)
       .def_rw("max_guided_distance", &MatchSettings::max_guided_distance)

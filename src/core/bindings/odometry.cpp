@@ -73,7 +73,7 @@ private:
 
 void bind_odometry(nb::module_ &module) {
   nb::class_<OdometrySettings>(module, "OdometrySettings",
-                               "See `engram.odometry.OdometryConfig` and `WindowConfig`.")
+                               "See `engram.odometry.odometry.OdometryConfig` and `WindowConfig`.")
       .def(nb::init<>())
       .def_rw("match", &OdometrySettings::match)
       .def_rw("window_frames", &OdometrySettings::window_frames)

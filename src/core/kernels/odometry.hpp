@@ -9,7 +9,8 @@
 
 namespace engram {
 
-// See engram.odometry.OdometryConfig and WindowConfig, which hold the defaults and their reasons.
+// See engram.odometry.odometry.OdometryConfig and WindowConfig, which hold the defaults and their
+// reasons.
 struct OdometrySettings {
   MatchSettings match;
   int32_t window_frames = 0, window_landmarks = 0, window_iterations = 0;

@@ -6,7 +6,7 @@
 
 namespace engram {
 
-// See engram.frontend.quantisation, where the tables come from.
+// See engram.frontend.blobs, where the tables come from.
 struct Quanta {
   float step_px;            // a power of two
   const float *sigma_px;    // value of each of `codes` codes

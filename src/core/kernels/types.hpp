@@ -21,7 +21,7 @@ struct Camera {
 // Descriptors have at most so many 64-bit words: distances are counted in 16 bits.
 constexpr int kMostWords = 256;
 
-// The landmarks of a frame, as `engram.frontend.Landmarks` has them.
+// The landmarks of a frame, as `engram.frontend.frame.Landmarks` has them.
 struct FrameView {
   int64_t count;
   int width; // of a descriptor, 64-bit words
@@ -34,7 +34,7 @@ struct FrameView {
   Camera camera;
 };
 
-// See `engram.frontend.MatcherConfig`, which holds the defaults and their reasons.
+// See `engram.frontend.matching.MatcherConfig`, which holds the defaults and their reasons.
 struct MatchSettings {
   int32_t max_distance = 0;
   int32_t max_guided_distance = 0;

@@ -21,11 +21,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from engram.agent.enrolment import PARTS, enrolled, signer_of
-from engram.agent.fetching import Fetch
-from engram.agent.link import Link, new_client
-from engram.agent.sending import FAILED, QUEUED, SENT, Outbox
-from engram.agent.settings import AgentSettings
+from engram.agent.link import PARTS, Link, enrolled, new_client, signer_of
+from engram.agent.outbox import FAILED, QUEUED, SENT, Fetch, Outbox
+from engram.agent.state import AgentSettings
 from engram.errors import (
     EngramError,
     InputError,
@@ -35,7 +33,8 @@ from engram.errors import (
     storage_full,
 )
 from engram.files import WriterLock
-from engram.maps import Map, check_file, copy_map
+from engram.maps.map import Map
+from engram.maps.map_files import check_file, copy_map
 
 if TYPE_CHECKING:
     import httpx
@@ -221,7 +220,7 @@ class Agent:
         _clear(staged)
         on = None
         if self.live.exists():
-            from engram.fleet.download import update
+            from engram.fleet.download.updating import update
 
             with Map.open(self.live) as store:
                 on = store.revision

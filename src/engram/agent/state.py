@@ -1,4 +1,4 @@
-"""The state of an agent: one SQLite file, so that a kill leaves it before or after a step."""
+"""The limits of an agent, and its state: one SQLite file that survives a kill at any moment."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import json
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from msgspec import Meta
 from sqlalchemy import MetaData
 
+from engram.config import check_bounds
 from engram.errors import MapError
 from engram.sqlite import FileKind, SqliteFile
 from engram.transfers import PartHash
@@ -172,3 +175,35 @@ class AgentState:
         """Drops them: the download is complete."""
         with self._writing() as connection:
             connection.execute("DELETE FROM arrived")
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSettings:
+    """Limits of the link and the disk, and what is downloaded.
+
+    Attributes:
+        download: options of ``engram download``, by the names of `DownloadOptions`.
+    """
+
+    download: dict[str, Any] = field(default_factory=dict)
+    bytes_per_s: (
+        Annotated[float, Meta(gt=0, description="bandwidth limit; none: no limit")] | None
+    ) = None
+    outbox_bytes: Annotated[
+        int, Meta(ge=0, description="disk for hand-ins that the centre has not stored yet, bytes")
+    ] = 10 * 2**30
+    first_retry_s: Annotated[float, Meta(gt=0, description="wait after a failure, s")] = 2.0
+    longest_retry_s: Annotated[
+        float, Meta(gt=0, description="each wait is twice the one before, up to this, s")
+    ] = 600.0
+    idle_s: Annotated[float, Meta(gt=0, description="pause between rounds without work, s")] = 30.0
+    judged_m: Annotated[
+        float, Meta(ge=0, description="a new map is judged after driving this far, m")
+    ] = 50.0
+    least_share: Annotated[
+        float,
+        Meta(ge=0, le=1, description="share of frames localised below which the last map returns"),
+    ] = 0.2
+
+    def __post_init__(self) -> None:
+        check_bounds(self)

@@ -9,8 +9,9 @@ import numpy as np
 from engram.calibration.cameras import Cameras, rectified_cameras
 from engram.config import load_toml
 from engram.errors import CalibrationError, ConfigError
-from engram.geometry import SE3, StereoCamera
+from engram.geometry.cameras import StereoCamera
 from engram.geometry.rectification import DistortionModel, RawCamera, RawStereoCalibration
+from engram.geometry.se3 import SE3
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,33 +1,209 @@
-"""A centre: its folder, its database, its objects, its maps."""
+"""A centre: its folder, its database, its objects, its open maps; limits, times and states."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from sqlalchemy import URL, Connection, select, update
+from msgspec import Meta
+from sqlalchemy import URL, Connection, Select, func, select, update
 
+from engram.centre.database import (
+    ServiceDatabase,
+    artifacts,
+    first_row,
+    handins,
+    maps,
+    note,
+    refs,
+    rows_of,
+)
 from engram.centre.errors import UnknownError
-from engram.centre.keeping import HandInState
-from engram.centre.resident import ResidentMaps
-from engram.centre.settings import DAY_NS, CentreSettings
-from engram.centre.store.audit import note
-from engram.centre.store.database import ServiceDatabase, first_row, rows_of
-from engram.centre.store.objects import BucketObjects, FolderObjects, Objects
-from engram.centre.store.packs import Packs
-from engram.centre.store.schema import handins, maps, refs
-from engram.config import from_dict, to_dict
+from engram.centre.objects import BucketObjects, FolderObjects, Objects, Packs
+from engram.config import check_bounds, from_dict, to_dict
 from engram.errors import InputError, MapLockedError
 from engram.files import WriterLock
-from engram.fleet.merge import NO_RELOCALISER, MergeOptions
-from engram.maps import Map
+from engram.fleet.merge.settings import NO_RELOCALISER, MergeOptions
+from engram.maps.map import Map
+from engram.maps.map_reader import MapReader
+from engram.maps.records import Revision
+
+
+@dataclass(slots=True)
+class _Held:
+    store: Map
+    inode: int
+    users: int = 0
+    retired: bool = False
+
+
+class ResidentMaps:
+    """Open maps, for reading, shared by threads.
+
+    What is read of a map once (its log, its nodes) stays until it has a new revision.
+    """
+
+    def __init__(self) -> None:
+        self._held: dict[Path, _Held] = {}
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def reading(self, path: Path) -> Iterator[Map]:
+        """The map as of its newest revision, which stays as it is within the block.
+
+        Raises:
+            MapError: it cannot be read.
+        """
+        with self._lock:
+            held = self._newest(path)
+            held.users += 1
+        try:
+            yield held.store
+        finally:
+            with self._lock:
+                held.users -= 1
+                _close_unused(held)
+
+    def close(self) -> None:
+        """Closes all maps that have no readers, and the others once their readers finish."""
+        with self._lock:
+            for held in self._held.values():
+                held.retired = True
+                _close_unused(held)
+            self._held.clear()
+
+    def _newest(self, path: Path) -> _Held:
+        held, inode = self._held.get(path), _inode(path)
+        if held is not None:
+            if held.inode == inode and held.store.resolve(None) == held.store.revision:
+                return held
+            del self._held[path]
+            held.retired = True
+            _close_unused(held)
+        held = self._held[path] = _Held(Map.open(path), inode)
+        return held
+
+
+def log_of(store: MapReader) -> tuple[Revision, ...]:
+    """Its revisions, oldest first, read once."""
+    return store.derived(_log)
+
+
+def _log(store: MapReader) -> tuple[Revision, ...]:
+    return tuple(store.log())
+
+
+def _inode(path: Path) -> int:
+    """Inode of a path, by which a restored backup is noticed; 0 if the file is missing."""
+    return path.stat().st_ino if path.exists() else 0
+
+
+def _close_unused(held: _Held) -> None:
+    if held.retired and not held.users:
+        held.store.close()
+
+
+DAY_NS = 86_400_000_000_000
+_GIB = 2**30
+
+
+@dataclass(frozen=True, slots=True)
+class CentreSettings:
+    """Limits and deadlines of a centre."""
+
+    token_s: Annotated[int, Meta(ge=10, description="life of a robot's token, s")] = 900
+    nonce_s: Annotated[
+        int, Meta(ge=1, description="time to sign the nonce of a token request, s")
+    ] = 60
+    code_days: Annotated[int, Meta(ge=1, description="life of an enrolment code, days")] = 7
+    bytes_a_day: Annotated[int, Meta(ge=0, description="upload limit of a robot, bytes a day")] = (
+        20 * _GIB
+    )
+    handin_bytes: Annotated[int, Meta(ge=0, description="size limit of one hand-in, bytes")] = (
+        8 * _GIB
+    )
+    open_handins: Annotated[
+        int, Meta(ge=1, description="incomplete hand-ins of a robot at once")
+    ] = 8
+    handin_days: Annotated[int, Meta(ge=1, description="life of an incomplete hand-in, days")] = 14
+    kept_days: Annotated[
+        int,
+        Meta(ge=0, description="life of unused parts, days"),
+    ] = 14
+    artifact_days: Annotated[int, Meta(ge=1, description="life of an unused download, days")] = 30
+    sweep_h: Annotated[float, Meta(gt=0, description="time between sweeps, h")] = 24.0
+    merge_tries: Annotated[
+        int, Meta(ge=1, description="times that a worker may die while merging one hand-in")
+    ] = 3
+    admission_bytes: Annotated[int, Meta(ge=2**28, description="memory of admission, bytes")] = (
+        4 * _GIB
+    )
+    admission_s: Annotated[int, Meta(ge=1, description="processor time of admission, s")] = 600
+    poll_s: Annotated[float, Meta(gt=0, description="a worker looks for work this often, s")] = 0.25
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+class HandInState(StrEnum):
+    """Where a hand-in is."""
+
+    OPEN = "open"  # parts are missing
+    COMPLETE = "complete"  # waits for a worker, or is in its hands
+    MERGED = "merged"
+    REFUSED = "refused"  # by the gate; a person may merge it all the same
+    FAILED = "failed"  # it is no map that can be merged here
+    CANCELLED = "cancelled"
+
+
+ENDED = frozenset(
+    {HandInState.MERGED, HandInState.REFUSED, HandInState.FAILED, HandInState.CANCELLED}
+)
+# Of downloads, and of dreams.
+READY, ASKED, FAILED = "ready", "asked", "failed"
+DONE, CANCELLED = "done", "cancelled"
+_UNDER_WAY = (HandInState.OPEN, HandInState.COMPLETE, HandInState.REFUSED)
+
+
+def manifest_key(name: str, manifest: str) -> str:
+    """Where a manifest is kept among the objects."""
+    return f"manifests/{name}/{manifest}"
+
+
+def needed_manifests(connection: Connection, name: str, limit_ns: int) -> list[str]:
+    """Manifests of one map whose parts must stay.
+
+    Those of hand-ins that are under way, refused, or ended since a time, and of what these
+    continue; of each robot's newest merged one, which its next one continues; and of downloads.
+    """
+    of_map = handins.c.map == name
+    newest = newest_merged(name)
+    late = handins.c.state.in_(map(str, _UNDER_WAY)) | (handins.c.ended_ns >= limit_ns)
+    found: list[str] = []
+    for query in (
+        select(handins.c.manifest).where(of_map, late),
+        select(handins.c.base).where(of_map, late, handins.c.base.is_not(None)),
+        select(handins.c.manifest).where(of_map, handins.c.place.in_(newest)),
+        select(artifacts.c.manifest).where(artifacts.c.map == name, artifacts.c.state == READY),
+    ):
+        found += connection.execute(query).scalars()
+    return list(dict.fromkeys(found))
+
+
+def newest_merged(name: str) -> Select[Any]:
+    """Places of each robot's newest merged hand-in to a map."""
+    merged = (handins.c.map == name) & (handins.c.state == str(HandInState.MERGED))
+    return select(func.max(handins.c.place)).where(merged).group_by(handins.c.robot)
+
 
 _HOUR_NS = DAY_NS // 24
 _SHOWN_CHARACTERS = 300

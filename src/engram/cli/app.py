@@ -1,19 +1,191 @@
-"""The `engram` program: its verbs, and what every one of them does with errors."""
+"""The `engram` program: its verbs in their groups, and what every one of them does with errors."""
 
 from __future__ import annotations
 
+import functools
+import inspect
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, cast
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from engram import PRE_RELEASE, __version__
-from engram.cli.endings import ExitStatus, PartlyDoneError, VerbInterruptedError
+from engram.cli.agent import agent_group
+from engram.cli.centre import centre_group
+from engram.cli.drive import drive_group, live
+from engram.cli.drives import doctor, localise, map_, record
+from engram.cli.fleet import build, download, dream, merge
+from engram.cli.frame import anchor, export, goal
+from engram.cli.history import diff, log, revert, show, tag
+from engram.cli.maps import amend, check, info, plot, view, vocabulary
+from engram.cli.options import ExitStatus, PartlyDoneError, Verb, VerbInterruptedError, spread
 from engram.cli.screen import UnwritableError, forget, screen
-from engram.cli.verbs import Program, register
-from engram.errors import EngramError, UnfitDriveError
+from engram.cli.showing import features, settings
+from engram.cli.trying import try_
+from engram.errors import ConfigError, EngramError, IncompatibleError, InputError, UnfitDriveError
+from engram.plugins import PluginGroup
+
+GROUPS: dict[str, dict[str, Callable[..., None]]] = {
+    "Drives": {
+        "try": try_,
+        "doctor": doctor,
+        "map": map_,
+        "localise": localise,
+        "record": record,
+        "live": live,
+    },
+    "Maps": {
+        "info": info,
+        "plot": plot,
+        "view": view,
+        "check": check,
+        "amend": amend,
+        "vocabulary": vocabulary,
+        "anchor": anchor,
+        "goal": goal,
+        "export": export,
+    },
+    "History": {"log": log, "show": show, "diff": diff, "tag": tag, "revert": revert},
+    "Fleet": {"merge": merge, "download": download, "build": build, "dream": dream},
+    "Settings": {"settings": settings, "features": features},
+}
+VERBS = {name: verb for group in GROUPS.values() for name, verb in group.items()}
+
+# Verbs with verbs of their own.
+NESTED: dict[str, dict[str, typer.Typer]] = {
+    "Drives": {"drive": drive_group},
+    "Service": {"centre": centre_group, "agent": agent_group},
+}
+
+# What the laboratory brings, a distribution of its own.
+LABORATORY = ("demo", "lab")
+# Other spellings of a verb.
+SPELLINGS = {"localize": "localise"}
+# Section of the verbs that installed packages add.
+_ADDED = "Lab"
+# Characters of a summary: a line of 80 holds it beside the name.
+_SUMMARY = 62
+_RESUMABLE = "interrupted; finished parts are kept, and the same command resumes"
+
+
+class Program(TyperGroup):
+    """Lists verbs by group, and accepts other spellings."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """One section of the help for each group."""
+        del ctx
+        width = max(len(name) for name in self.commands)
+        for title in dict.fromkeys(_group(verb) for verb in self.commands.values()):
+            with formatter.section(title):
+                formatter.write_dl(
+                    [
+                        (f"{name:{width}}", verb.get_short_help_str(_SUMMARY))
+                        for name, verb in self.commands.items()
+                        if _group(verb) == title
+                    ]
+                )
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """The verb of this name, in either spelling."""
+        return super().get_command(ctx, SPELLINGS.get(cmd_name, cmd_name))
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The verb that the arguments begin with.
+
+        Raises:
+            InputError: it comes with the laboratory, which is not installed.
+        """
+        if args[0] in LABORATORY and args[0] not in self.commands:
+            raise InputError(
+                f"`engram {args[0]}` comes with engram-lab, which is not installed; from "
+                "a checkout of Engram: pip install ./lab"
+            )
+        return super().resolve_command(ctx, args)
+
+
+def _group(verb: Any) -> str:
+    return str(getattr(verb, "rich_help_panel", None) or _ADDED)
+
+
+def register(app: typer.Typer) -> None:
+    """Gives the program its verbs, and those that other installed packages bring."""
+    for title, verbs in GROUPS.items():
+        for name, verb in verbs.items():
+            app.command(name, cls=Verb, rich_help_panel=title)(_tells_of_interruption(spread(verb)))
+    for title, groups in NESTED.items():
+        for name, group in groups.items():
+            _prepare(group)
+            app.add_typer(group, name=name, rich_help_panel=title)
+    own = {*VERBS, *(name for groups in NESTED.values() for name in groups)}
+    for name in _PLUGINS.names():
+        if name not in own:
+            _add(app, name)
+
+
+def _add(app: typer.Typer, name: str) -> None:
+    """Adds a verb of another package; one that cannot be used says so, and the others work."""
+    try:
+        added = _PLUGINS.load(name)
+    except IncompatibleError as error:
+        anything = {"ignore_unknown_options": True, "allow_extra_args": True}
+        register_as = app.command(name, cls=Verb, rich_help_panel=_ADDED, context_settings=anything)
+        register_as(_refusal(error))
+        return
+    if isinstance(added, typer.Typer):
+        _prepare(added)
+        app.add_typer(added, name=name, rich_help_panel=_ADDED)
+        return
+    verb = _tells_of_interruption(spread(added))
+    app.command(name, cls=Verb, rich_help_panel=_ADDED)(verb)
+
+
+def _refusal(error: IncompatibleError) -> Callable[[], None]:
+    def refused() -> None:
+        """Cannot be used: its package is broken."""
+        raise error
+
+    return refused
+
+
+def _checked(name: str, found: Any) -> Callable[..., None] | typer.Typer:
+    del name
+    if isinstance(found, typer.Typer) or inspect.isfunction(found):
+        return found
+    raise ConfigError(f"{found!r} is of type {type(found).__name__}, must be a function or a Typer")
+
+
+# Functions, or Typer groups of them.
+_PLUGINS = PluginGroup("engram.verbs", "verb", _checked)
+
+
+def _prepare(group: typer.Typer) -> None:
+    """The same for every verb of a group, and of the groups in it."""
+    for command in group.registered_commands:
+        assert command.callback is not None
+        command.callback = _tells_of_interruption(spread(command.callback), _RESUMABLE)
+        command.cls = command.cls if issubclass(command.cls or TyperCommand, Verb) else Verb
+    for inner in group.registered_groups:
+        assert inner.typer_instance is not None
+        _prepare(inner.typer_instance)
+
+
+def _tells_of_interruption(
+    verb: Callable[..., None], told: str = "interrupted; nothing had been saved yet"
+) -> Callable[..., None]:
+    """Reports Ctrl-C like any other end, if the verb itself has nothing more to save."""
+
+    @functools.wraps(verb)
+    def run(*arguments: Any, **options: Any) -> None:
+        try:
+            verb(*arguments, **options)
+        except KeyboardInterrupt:
+            raise VerbInterruptedError(told) from None
+
+    return run
+
 
 app = typer.Typer(
     name="engram",

@@ -2,16 +2,218 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
-from engram.cli.centre_maps import dream, jobs, map_
-from engram.cli.centre_options import BY, NONE, Database, Folder, MapName, Objects, open_centre
-from engram.cli.outputs import output_folder
-from engram.errors import ConfigError
+from engram.cli import options
+from engram.cli.options import output_folder
+from engram.errors import ConfigError, InputError
+
+if TYPE_CHECKING:
+    from engram.centre.service import Centre
+
+
+Folder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="The centre's folder.")]
+MapName: TypeAlias = Annotated[
+    str, typer.Option("--map", metavar="NAME", help="Which of the centre's maps.")
+]
+Database: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--database", metavar="URL", help="postgresql+psycopg://… [default: SQLite in FOLDER]."
+    ),
+]
+Objects: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--objects", metavar="URL", help="s3://bucket/prefix [default: files in FOLDER]."),
+]
+BY = "shell"
+NONE = "none"
+
+
+def open_centre(folder: Path, database: str | None = None, objects: str | None = None) -> Centre:
+    """A centre that is there.
+
+    Raises:
+        InputError: it is not there; `serve` and `map` make one, a mistyped name does not.
+    """
+    from engram.centre.service import Centre
+
+    if not (folder / ("maps" if database else "centre.sqlite")).exists():
+        raise InputError(f"{folder}: there is no centre; start one: engram centre serve {folder}")
+    return Centre(folder, database, objects)
+
+
+def map_(
+    folder: Folder,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A new or existing map.")],
+    *,
+    gate: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--gate",
+            metavar="DRIVE",
+            help="Held-out drive that must not localise worse; repeatable; none for no gate.",
+        ),
+    ] = None,
+    moves: Annotated[
+        str | None,
+        typer.Option(
+            "--moves",
+            metavar="REF",
+            help="Version that is moved to each merge that passed the gate; none for none.",
+        ),
+    ] = None,
+    quiet: Annotated[
+        str | None,
+        typer.Option(
+            "--quiet",
+            metavar="FROM-TO",
+            help="Hours UTC in which the centre dreams, as 22-5; or none.",
+        ),
+    ] = None,
+    settings: options.SettingsGiven,
+    database: Database = None,
+) -> None:
+    """Make a map, or change how its hand-ins are merged.
+
+    Options that are left out keep their values; --set and --config replace all settings of merging.
+
+    \b
+    Examples:
+      engram centre map town campus --gate held-out.framelog --moves stable
+      engram centre map town fleet --set merge.rounds=8
+    """
+    from engram.centre.service import Centre
+    from engram.cli.fleet import merging_of
+
+    changes: dict[str, Any] = {}
+    if settings.config is not None or settings.changes:
+        changes["merge"] = merging_of(settings.read())
+    if gate:
+        changes["gate"] = _gate(gate)
+    if moves is not None:
+        changes["moves"] = _movable(moves)
+    if quiet is not None:
+        changes["quiet"] = _hours(quiet)
+    with Centre(folder, database) as centre:
+        centre.add_map(name, BY)
+        policy = replace(centre.policy(name), **changes)
+        centre.set_policy(name, policy, BY)
+    typer.echo(
+        f"{name}: gate {', '.join(policy.gate) or NONE}, moves {policy.moves or NONE}, "
+        f"quiet {NONE if policy.quiet is None else '{:g}-{:g}'.format(*policy.quiet)}"
+    )
+
+
+def _gate(drives: list[Path]) -> tuple[str, ...]:
+    """Held-out drives, each of which opens: with one that does not, every hand-in would fail."""
+    from engram.sequences.opening import open_drive
+
+    if drives == [Path(NONE)]:
+        return ()
+    for one in drives:
+        open_drive(one)
+    return tuple(str(one.absolute()) for one in drives)
+
+
+def _movable(ref: str) -> str | None:
+    from engram.centre.fleet import check_movable
+
+    if ref == NONE:
+        return None
+    check_movable(ref)
+    return ref
+
+
+def _hours(text: str) -> tuple[float, float] | None:
+    """The quiet hours, as FROM-TO."""
+    if text == NONE:
+        return None
+    begin, _, end = text.partition("-")
+    try:
+        found = float(begin), float(end)
+    except ValueError:
+        found = (-1.0, -1.0)
+    if not all(0.0 <= one <= 24.0 for one in found):
+        raise ConfigError(f"--quiet {text!r:.40} is not FROM-TO in hours of the day, such as 22-5")
+    return found
+
+
+def dream(
+    folder: Folder,
+    *,
+    map_name: MapName = "fleet",
+    cancel: Annotated[
+        str | None, typer.Option("--cancel", metavar="DREAM", help="End this one.")
+    ] = None,
+    as_json: options.Json = False,
+    database: Database = None,
+) -> None:
+    """Ask for a dream, for whenever no robot waits.
+
+    It looks for a better map in what robots handed in, judged by the map's held-out drives. The
+    same command prints the outcome.
+
+    \b
+    Examples:
+      engram centre dream town
+    """
+    from engram.centre.jobs import Dreams
+
+    with open_centre(folder, database) as centre:
+        dreams = Dreams(centre)
+        row = dreams.ask(map_name, BY) if cancel is None else dreams.cancel(dreams.get(cancel), BY)
+    typer.echo(json.dumps(row) if as_json else _told(row))
+
+
+def jobs(
+    folder: Folder,
+    *,
+    map_name: MapName = "fleet",
+    cancel: Annotated[
+        str | None,
+        typer.Option("--cancel", metavar="JOB", help="Cancel this hand-in: its id as listed."),
+    ] = None,
+    as_json: options.Json = False,
+    database: Database = None,
+) -> None:
+    """List hand-ins and dreams and their state, newest last.
+
+    \b
+    Examples:
+      engram centre jobs town
+      engram centre jobs town --map campus --json
+    """
+    from engram.centre.handins import HandIns
+    from engram.centre.jobs import Dreams
+
+    with open_centre(folder, database) as centre:
+        centre.map_row(map_name)
+        handins = HandIns(centre)
+        if cancel is not None:
+            handins.cancel(handins.get(cancel), BY)
+        rows = handins.listed(map_name, None, None, 2**62, 1000)
+        dreamt = Dreams(centre).listed(map_name)
+    if as_json:
+        print(json.dumps({"jobs": rows, "dreams": dreamt}))
+        return
+    for row in reversed(rows):
+        typer.echo(_told(row))
+    for row in reversed(dreamt):
+        typer.echo(f"dream {_told(row)}")
+
+
+def _told(row: dict[str, Any]) -> str:
+    """A job on one line."""
+    fact = row["error"] or row["progress"] or ""
+    revision = "" if row["revision"] is None else f" revision {row['revision']}"
+    return f"{row['id']} {row['state']}{revision} {fact}".rstrip()
 
 
 def serve(
@@ -102,7 +304,7 @@ def code(
       engram centre code town
       engram centre code town --follows stable
     """
-    from engram.centre.access.enrolment import new_code
+    from engram.centre.access import new_code
 
     with open_centre(folder, database) as centre:
         print(new_code(centre, map_name, follows, BY))
@@ -129,8 +331,7 @@ def token(
       engram centre token town --name alice --role operator
       engram centre token town --name alice --role none
     """
-    from engram.centre.access.enrolment import add_person, take_away
-    from engram.centre.access.roles import Role
+    from engram.centre.access import Role, add_person, take_away
 
     roles = [str(one) for one in Role if one is not Role.ROBOT]
     if role not in {*roles, NONE}:
@@ -152,7 +353,7 @@ def sweep(folder: Folder, *, database: Database = None, objects: Objects = None)
     Examples:
       engram centre sweep town
     """
-    from engram.centre.worker.sweeping import sweep as run
+    from engram.centre.worker import sweep as run
 
     with open_centre(folder, database, objects) as centre:
         for name in centre.map_names():
@@ -177,7 +378,7 @@ def backup(
     Examples:
       engram centre backup town town-backup
     """
-    from engram.centre.backup import back_up
+    from engram.centre.serving import back_up
 
     with open_centre(folder, database, objects) as centre:
         for name, revision in back_up(centre, target).items():

@@ -1,26 +1,30 @@
-"""`engram drive info` and `engram drive calibration`: what a drive holds, before it is used."""
+"""`engram drive …`: what a drive holds; `engram live`: a process that localises while driving."""
 
 from __future__ import annotations
 
 import json
 import shlex
+import signal
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from engram.cli import options, outputs
-from engram.cli.help import VerbInFull
+from engram.cli import options
+from engram.cli.options import VerbInFull, VerbInterruptedError, untrusted_if
 from engram.counts import counted
+from engram.errors import ConfigError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from engram.calibration import Cameras
-    from engram.sequences import BagSequence, ImageSequence
-    from engram.sequences.bags.inspecting import BagFacts
+    from engram.calibration.cameras import Cameras
+    from engram.sequences.bags.sequence import BagFacts, BagSequence
+    from engram.sequences.layouts import ImageSequence
+
 
 drive_group = typer.Typer(
     help="Look at a drive: topics, calibration.",
@@ -48,8 +52,8 @@ def info(
       engram drive info monday/ --left /front/left/image_raw
     """
     from engram.config import plain
-    from engram.sequences.bags import is_bag
-    from engram.sequences.bags.inspecting import describe_bag
+    from engram.sequences.bags.containers import is_bag
+    from engram.sequences.bags.sequence import describe_bag
 
     if is_bag(path) and opening.format in {None, "bag"}:
         facts = describe_bag(path, opening.options())
@@ -67,7 +71,7 @@ def info(
 
 def _judge(faulty_share: float) -> None:
     """Ends with the status of losses if too many frames are left out for a wrong stamp."""
-    from engram.doctor import DoctorConfig
+    from engram.doctor.examination import DoctorConfig
 
     if faulty_share > DoctorConfig().faulty_share:
         raise typer.Exit(3)
@@ -84,7 +88,7 @@ def calibration(
             "--picture",
             metavar="PNG",
             help="The picture [default: DRIVE-calibration.png].",
-            parser=outputs.output_file,
+            parser=options.output_file,
         ),
     ] = None,
     as_json: options.Json = False,
@@ -105,9 +109,9 @@ def calibration(
     from engram.config import plain
     from engram.errors import ConfigError
     from engram.monitor import write_whole
-    from engram.sequences import FrameLog
+    from engram.sequences.framelog.reader import FrameLog
     from engram.untrusted import printable
-    from engram.viewing.rectified import rectified_picture, row_offsets_px
+    from engram.viewing.pictures import rectified_picture, row_offsets_px
 
     sequence = opening.open(path)
     if isinstance(sequence, FrameLog):
@@ -171,7 +175,7 @@ def _rows_text(offsets: NDArray[np.float64]) -> str:
 
 
 def _toml(cameras: Cameras) -> str:
-    from engram.calibration import calibration_toml
+    from engram.calibration.toml import calibration_toml
     from engram.errors import CalibrationError
 
     try:
@@ -218,7 +222,8 @@ def _size(size_bytes: int) -> str:
 
 
 def _drive_facts(path: Path, opening: options.Drive) -> dict[str, Any]:
-    from engram.sequences import ImageSequence, stamps_of
+    from engram.sequences.layouts import ImageSequence
+    from engram.sequences.opening import stamps_of
 
     sequence = opening.open(path)
     stamps_ns = getattr(sequence, "stamps_ns", None)
@@ -247,3 +252,89 @@ def _drive_text(facts: dict[str, Any]) -> str:
         + "".join(f"stamps: {fact}\n" for fact in facts["stamps"])
         + f"next: {facts['command']}"
     )
+
+
+def live(
+    map_path: options.MapPath,
+    *,
+    play: Annotated[
+        Path | None, typer.Option("--play", metavar="DRIVE", help="Play this drive as the camera.")
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            "--rate", metavar="HZ", help="Play at this rate [default: as fast as it goes]."
+        ),
+    ] = None,
+    socket: Annotated[
+        Path | None,
+        typer.Option(
+            "--socket", metavar="PATH", help="Listen for a robot's middleware at this socket."
+        ),
+    ] = None,
+    once: Annotated[
+        bool, typer.Option("--once", help="End when the middleware disconnects.")
+    ] = False,
+    name: Annotated[
+        str, typer.Option("--robot", metavar="NAME", help="Name of the robot.")
+    ] = "robot",
+    maps: Annotated[
+        bool, typer.Option("--map", help="Map what the robot does not recognise.")
+    ] = False,
+    effort: options.Effort,
+    deadline: Annotated[
+        float | None,
+        typer.Option(
+            "--deadline", metavar="MS", help="Start no attempt later than this after the frame."
+        ),
+    ] = None,
+    view: options.View = None,
+    settings: options.SettingsGiven,
+) -> None:
+    """Localise while a robot drives.
+
+    Takes frames from a robot's middleware, such as the ROS 2 bridge, or plays a drive. Prints one
+    line of JSON for each result (where the robot is, or that it is lost) and a status five times a
+    second. The newest frame is used; older ones are dropped.
+
+    \b
+    Examples:
+      engram live town.engram --socket /run/engram/r1.sock --robot r1
+      engram live town.engram --socket /run/engram/r1.sock --map --deadline 40
+      engram live town.engram --play drives/tuesday --rate 20
+    """
+    from engram.live.driving import LiveOptions
+    from engram.live.process import LiveProcess
+    from engram.live.served import Played, Served, Transport
+    from engram.robot.settings import RobotOptions
+    from engram.sequences.opening import open_drive
+    from engram.viewing.viewer import viewer_for
+
+    # A process that is asked to end commits what it mapped, as after Ctrl-C.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if (play is None) == (socket is None):
+        raise ConfigError("give either --socket PATH, to serve a robot, or --play DRIVE")
+    if rate is not None and (play is None or not rate > 0):
+        raise ConfigError(f"--rate {rate}: must be > 0 Hz, and goes with --play DRIVE only")
+    given = settings.read()
+    asked = RobotOptions(**effort.over(given), deadline_ms=deadline)
+    resolved = LiveOptions(map_path, name, maps, given.of_robot(), asked)
+    with ExitStack() as stack:
+        viewer = stack.enter_context(viewer_for(view))
+        transport: Transport
+        if play is not None:
+            transport = Played(open_drive(play), _print, rate)
+        else:
+            assert socket is not None
+            transport = stack.enter_context(Served(socket, once=once))
+        process = LiveProcess(transport, resolved, watcher=viewer)
+        try:
+            process.run()
+        except KeyboardInterrupt:
+            told = f"interrupted; {process.saving.text()}"
+            raise VerbInterruptedError(told) from None
+    untrusted_if(process.unfit)
+
+
+def _print(message: dict[str, Any]) -> None:
+    print(json.dumps(message), flush=True)

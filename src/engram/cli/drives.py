@@ -1,26 +1,89 @@
-"""`engram map`, `localise`, `record`: what is done with one drive."""
+"""`engram map`, `localise`, `record`, `doctor`: what is done with one drive."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from engram.cli import options, outputs
-from engram.cli.endings import ExitStatus, untrusted_if
-from engram.cli.losses import losses_told
-from engram.errors import ConfigError
+from engram.cli import options
+from engram.cli.options import ExitStatus, VerbInterruptedError, untrusted_if
+from engram.errors import ConfigError, EngramError
 
 if TYPE_CHECKING:
-    from engram.maps import Map
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from engram.calibration.cameras import Cameras
+    from engram.doctor.table import Diagnosis
+    from engram.frontend.frame import StereoPair
+    from engram.maps.map import Map
+    from engram.robot.front import Arrived
     from engram.robot.settings import Settings
+    from engram.sequences.opening import Drive
+
+
+@contextmanager
+def losses_told(sequence: Drive) -> Iterator[None]:
+    """Around what a verb does with a drive: says on stderr what of it could not be used.
+
+    A verb that fails keeps its exit status: a loss may be the reason.
+
+    Raises:
+        Exit: parts of a bag were lost, or more frames than the doctor allows were left out for a
+            wrong stamp; what could be read was used.
+    """
+    _noted(sequence)
+    try:
+        yield
+    except (EngramError, VerbInterruptedError, typer.Exit):
+        _told(sequence, "parts of the bag could not be read:")
+        raise
+    if _told(sequence, "parts of the bag could not be read; the rest was used:"):
+        raise typer.Exit(ExitStatus.LOST_PARTS)
+
+
+def _noted(sequence: Drive) -> None:
+    """Says what of a drive's calibration was read otherwise than it is written."""
+    from engram.sequences.bags.sequence import BagSequence
+    from engram.sequences.layouts import ImageSequence
+
+    notes: Sequence[str] = ()
+    if isinstance(sequence, BagSequence):
+        notes = sequence.notes
+    elif isinstance(sequence, ImageSequence):
+        notes = sequence.cameras.notes
+    for note in notes:
+        typer.echo(f"note: {note}", err=True)
+
+
+def _told(sequence: Drive, heading: str) -> bool:
+    """Says how images were paired, what was lost and left out; whether it was too much."""
+    from engram.doctor.examination import DoctorConfig
+    from engram.sequences.bags.sequence import BagSequence
+    from engram.sequences.framelog.reader import FrameLog
+    from engram.sequences.opening import stamps_of
+
+    if isinstance(sequence, BagSequence) and sequence.pairing.left:
+        typer.echo(sequence.pairing.text(), err=True)
+    lost = sequence.lost if isinstance(sequence, BagSequence) else []
+    for line in [heading, *(f"  {loss}" for loss in lost)] if lost else []:
+        typer.echo(line, err=True)
+    if isinstance(sequence, FrameLog):
+        return False
+    for fact in sequence.stamp_facts:
+        typer.echo(f"warning: {fact}", err=True)
+    return bool(lost) or stamps_of(sequence).faulty_share > DoctorConfig().faulty_share
 
 
 def map_(
-    map_path: outputs.WrittenMap,
+    map_path: options.WrittenMap,
     path: options.DrivePath,
     *,
     drive: options.Drive,
@@ -30,7 +93,7 @@ def map_(
     force: Annotated[
         bool, typer.Option("--force", help="Map the drive even if the doctor finds it unfit.")
     ] = False,
-    view: outputs.View = None,
+    view: options.View = None,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
@@ -48,9 +111,10 @@ def map_(
       engram map town.engram sequences/06 --frames 0:50:2
     """
     sequence = drive.open(path)
-    from engram.cli.progress import Bars
+    from engram.cli.screen import Bars
     from engram.cli.wording import mapped_text, warnings
-    from engram.robot import Beginning, RobotOptions, map_drive
+    from engram.robot.mapping import Beginning, map_drive
+    from engram.robot.settings import RobotOptions
     from engram.viewing.viewer import viewer_for
 
     given = settings.read()
@@ -95,7 +159,7 @@ def localise(
             "--trajectory",
             metavar="FILE",
             help="Write the trajectory in TUM format.",
-            parser=outputs.output_file,
+            parser=options.output_file,
         ),
     ] = None,
     pictures: Annotated[
@@ -104,7 +168,7 @@ def localise(
             "--pictures",
             metavar="DIR",
             help="Write about 20 pictures of matches.",
-            parser=outputs.output_folder,
+            parser=options.output_folder,
         ),
     ] = None,
     rate: Annotated[
@@ -121,11 +185,11 @@ def localise(
             "--recorder",
             metavar="DIR",
             help="When lost, write the last 30 s to a file.",
-            parser=outputs.output_folder,
+            parser=options.output_folder,
         ),
     ] = None,
     no_images: Annotated[bool, typer.Option("--no-images", help="Record no images.")] = False,
-    view: outputs.View = None,
+    view: options.View = None,
     explain: Annotated[
         int | None,
         typer.Option(
@@ -155,10 +219,10 @@ def localise(
       engram localise town.engram drives/tuesday --explain 120
     """
     sequence = drive.open(path)
-    from engram.cli.explaining import explain_and_print
-    from engram.cli.localising import Outputs, localise_and_print
-    from engram.robot import RobotOptions, open_map
+    from engram.cli.localising import Outputs, explain_and_print, localise_and_print
+    from engram.maps.map import open_map
     from engram.robot.explaining import ExplainOptions
+    from engram.robot.settings import RobotOptions
 
     found_by = None if relocaliser == "none" else relocaliser
     given = settings.read()
@@ -189,7 +253,7 @@ def record(
     out: Annotated[
         Path,
         typer.Argument(
-            metavar="LOG", help="The frame log, NAME.framelog.", parser=outputs.output_file
+            metavar="LOG", help="The frame log, NAME.framelog.", parser=options.output_file
         ),
     ],
     *,
@@ -210,8 +274,8 @@ def record(
       engram record 2011_09_26_drive_0001_sync colour.framelog --rig colour --channel blue
     """
     sequence = drive.open(path)
-    from engram.cli.progress import Bars
-    from engram.robot import extract_log
+    from engram.cli.screen import Bars
+    from engram.robot.mapping import extract_log
 
     resolved = settings.read().of_robot(features)
     with losses_told(sequence):
@@ -229,7 +293,7 @@ def record(
 
 def _asked_kind(settings: Settings) -> str | None:
     """The kind of features that the settings name; None for the default, which follows a map's."""
-    from engram.frontend import FrontendConfig
+    from engram.frontend.frontend import FrontendConfig
 
     kind = settings.frontend.descriptor
     return None if kind == FrontendConfig().descriptor else kind
@@ -264,3 +328,93 @@ def _for_people(settings: Settings, no_thumbnails: bool) -> Settings:
     if not no_thumbnails:
         return settings
     return replace(settings, frontend=replace(settings.frontend, thumbnails=False))
+
+
+_PICTURES = 4
+
+
+def doctor(
+    path: options.DrivePath,
+    *,
+    drive: options.Drive,
+    hours: Annotated[
+        bool, typer.Option("--hours", help="Check the clock, which missions by hour need.")
+    ] = False,
+    pictures: Annotated[
+        Path | None,
+        typer.Option(
+            "--pictures",
+            metavar="DIR",
+            help="Draw four pairs with what both sides show, and what moves with the camera.",
+            parser=options.output_folder,
+        ),
+    ] = None,
+    settings: options.SettingsGiven,
+    as_json: options.Json = False,
+) -> None:
+    """Find out what is wrong with a drive.
+
+    Checks up to 200 frames: whether left and right are swapped, misaligned or unsynchronised; time
+    stamps, odometry, images and optics. Each finding states a value, its limit and a cure. The exit
+    status is 4 if a finding is fatal; engram map refuses such a drive.
+
+    \b
+    Examples:
+      engram doctor drives/monday
+      engram doctor drives/monday --json --pictures looks
+      engram doctor drives/monday --hours --zone Europe/London
+    """
+    from engram.cli.screen import Bars
+    from engram.robot.mapping import examine_drive
+    from engram.sequences.sequence import LoggedFrame
+
+    sequence = dataclasses.replace(drive, skip_bad=True).open(path)
+    resolved = settings.read().of_robot()
+    most = min(len(sequence), resolved.doctor.frames)
+    with losses_told(sequence):
+        with Bars().stage("doctor", most) as monitor:
+            pairs: list[StereoPair] = []
+
+            def keep(number: int, arrived: Arrived) -> None:
+                wanted = number * _PICTURES // max(most, 1) == len(pairs)
+                if pictures is not None and wanted and not isinstance(arrived, LoggedFrame):
+                    pairs.append(arrived)
+
+            diagnosis = examine_drive(sequence, resolved, monitor, by_hour=hours, seen=keep)
+        if pictures is not None:
+            _draw(pictures, pairs)
+            _draw_fixed(pictures, pairs, diagnosis, getattr(sequence, "cameras", None))
+        print(json.dumps(diagnosis.to_dict()) if as_json else diagnosis.text())
+        if diagnosis.fatal:
+            raise typer.Exit(ExitStatus.UNFIT_DRIVE)
+
+
+def _draw(folder: Path, pairs: list[StereoPair]) -> None:
+    """Writes a picture of each pair."""
+    from engram.viewing.pictures import side_picture
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, pair in enumerate(pairs, start=1):
+        _write(folder / f"pair-{number}.png", side_picture(pair))
+
+
+def _draw_fixed(
+    folder: Path, pairs: list[StereoPair], diagnosis: Diagnosis, cameras: Cameras | None
+) -> None:
+    """Writes what moves with the camera, as a picture and as a file for --mask."""
+    from engram.sequences.calibrating import mask_image
+    from engram.viewing.pictures import fixed_picture
+
+    if diagnosis.seen is None or cameras is None or not pairs:
+        return
+    _write(folder / "fixed.png", fixed_picture(pairs[-1], diagnosis.seen))
+    _write(folder / "mask.png", mask_image(diagnosis.seen, cameras))
+
+
+def _write(path: Path, picture: NDArray[np.uint8]) -> None:
+    import cv2
+
+    from engram.monitor import write_whole
+
+    with write_whole(path) as draft:
+        draft.write_bytes(cv2.imencode(".png", picture)[1].tobytes())

@@ -1,4 +1,4 @@
-"""`engram merge`, `download`, `build`: the fleet map."""
+"""`engram merge`, `download`, `build`, `dream`: the fleet map."""
 
 from __future__ import annotations
 
@@ -9,20 +9,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from engram.cli import options, outputs
-from engram.cli.endings import ExitStatus, PartlyDoneError, VerbInterruptedError
+from engram.cli import options
 from engram.cli.history import AUTHOR
+from engram.cli.options import ExitStatus, PartlyDoneError, VerbInterruptedError
 from engram.errors import ConfigError, EngramError
 
 if TYPE_CHECKING:
     from engram.cli.settings import AllSettings
-    from engram.fleet.build import JudgeOptions
-    from engram.fleet.download import DownloadReport, UpdateReport
-    from engram.fleet.merge import MergeOptions, MergeReport
+    from engram.fleet.build.orders import JudgeOptions
+    from engram.fleet.download.downloading import DownloadReport
+    from engram.fleet.download.updating import UpdateReport
+    from engram.fleet.merge.report import MergeReport
+    from engram.fleet.merge.settings import MergeOptions
 
 
 def merge(
-    centre: outputs.WrittenFleetMap,
+    centre: options.WrittenFleetMap,
     robots: Annotated[
         list[Path],
         typer.Argument(
@@ -51,7 +53,7 @@ def merge(
             "--picture",
             metavar="FILE",
             help="Draw the fleet map before and after.",
-            parser=outputs.output_picture,
+            parser=options.output_picture,
         ),
     ] = None,
     geometry: Annotated[
@@ -76,10 +78,10 @@ def merge(
       engram merge fleet.engram r1.engram --dry-run --picture merge.png
       engram merge fleet.engram r1.engram --require-better held-out.framelog
     """
-    from engram.cli.progress import Bars
+    from engram.cli.screen import Bars
     from engram.fleet.dream import keep_hand_in
-    from engram.fleet.merge import GeometryGate
-    from engram.fleet.merge import merge as merge_maps
+    from engram.fleet.merge.gate import GeometryGate
+    from engram.fleet.merge.merging import merge as merge_maps
 
     reports: list[MergeReport] = []
 
@@ -128,7 +130,7 @@ def _merges(reports: list[MergeReport]) -> dict[str, Any]:
 
 def merging_of(settings: AllSettings) -> MergeOptions:
     """How the settings say that maps are merged."""
-    from engram.fleet.merge import MergeOptions
+    from engram.fleet.merge.settings import MergeOptions
 
     return MergeOptions.of(settings.merge, os.environ.get(AUTHOR))
 
@@ -142,7 +144,7 @@ def download(
         typer.Argument(
             metavar="OUT",
             help="The robot's map: a new file, or with --update its own.",
-            parser=outputs.output_map,
+            parser=options.output_map,
         ),
     ],
     *,
@@ -220,10 +222,10 @@ def download(
       engram download fleet.engram r1.engram --select tod --depart 3:00 --route 5f3a
       engram download fleet.engram r1.engram --select budget --budget 25% --depart 17:00
     """
-    from engram.cli.progress import Bars
-    from engram.fleet.download import budget_from_text, hour_from_text
-    from engram.fleet.download import download as send
-    from engram.fleet.download import update as take_in
+    from engram.cli.screen import Bars
+    from engram.fleet.download.downloading import download as send
+    from engram.fleet.download.mission import budget_from_text, hour_from_text
+    from engram.fleet.download.updating import update as take_in
     from engram.monitor import interruptible
 
     budget_bytes, budget_percent = budget_from_text(budget)
@@ -252,7 +254,7 @@ def download(
 
 
 def build(
-    centre: outputs.WrittenFleetMap,
+    centre: options.WrittenFleetMap,
     drives: Annotated[
         list[str], typer.Argument(metavar="DRIVE", help="Frame logs or drives: paths or URLs.")
     ],
@@ -308,9 +310,9 @@ def build(
       engram build town.engram logs/*.framelog --groups 4 --grouping random:7
       engram build town.engram logs/*.framelog --groups 3 --order best --validate held-out.framelog
     """
-    from engram.cli.progress import Bars
-    from engram.fleet.build import BuildOptions, build_map
-    from engram.robot import RobotOptions
+    from engram.cli.screen import Bars
+    from engram.fleet.build.building import BuildOptions, build_map
+    from engram.robot.settings import RobotOptions
 
     resolved = settings.read()
     merging = merging_of(resolved)
@@ -334,7 +336,7 @@ def build(
     report = build_map(centre, drives, resolved.of_robot(), asked, keep=keep, monitor=Bars())
     looked = None
     if geometry and not report.interrupted:
-        from engram.repair import check_geometry
+        from engram.repair.repairing import check_geometry
 
         looked = check_geometry(centre, resolved.repair, monitor=Bars())
     if as_json:
@@ -366,7 +368,7 @@ def _judge(order: str | None, drives: list[Path], given: AllSettings) -> JudgeOp
     Raises:
         ConfigError: there is no such order, or drives are given and no order is searched for.
     """
-    from engram.fleet.build import JudgeOptions, Orders
+    from engram.fleet.build.orders import JudgeOptions, Orders
 
     known = {"best": Orders.ALL, "best-first": Orders.FIRST}
     if order is None:
@@ -382,3 +384,75 @@ def _judge(order: str | None, drives: list[Path], given: AllSettings) -> JudgeOp
         orders=known[order],
         estimator=given.build.estimator,
     )
+
+
+def dream(
+    centre: Annotated[
+        Path, typer.Argument(metavar="FLEET", help="The fleet map.", parser=options.map_file)
+    ],
+    handed: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="ROBOT",
+            help="Robots' maps as handed in [default: those kept by merge --keep].",
+            parser=options.map_file,
+        ),
+    ] = None,
+    *,
+    validate: Annotated[
+        list[Path],
+        typer.Option(
+            "--validate", metavar="DRIVE", help="Held-out drive; give three or more. Required."
+        ),
+    ],
+    minutes: Annotated[
+        float | None,
+        typer.Option(
+            "--minutes", metavar="MIN", help="Stop after this long [default: try everything]."
+        ),
+    ] = None,
+    workers: Annotated[
+        int, typer.Option("--workers", metavar="N", min=1, help="Processes on this machine.")
+    ] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="Try on a Dask cluster instead."),
+    ] = None,
+    settings: options.SettingsGiven,
+    as_json: options.Json = False,
+) -> None:
+    """Optimise a fleet map by held-out drives.
+
+    Merges the robots' maps again, in other orders and with other settings, and compares the results
+    on held-out drives. If the drives then localise significantly better, what is new in the best
+    result is added to the fleet map as one revision. Nothing is removed. The same command resumes
+    an interrupted search.
+
+    \b
+    Examples:
+      engram dream fleet.engram r1.engram --validate mon --validate tue --validate wed
+      engram dream fleet.engram --validate mon --validate tue --validate wed --minutes 30
+    """
+    from engram.cli.screen import Bars
+    from engram.fleet.dream import DreamOptions, hand_ins_of
+    from engram.fleet.dream import dream as look_for_better
+    from engram.monitor import interruptible
+
+    given = settings.read()
+    asked = DreamOptions(
+        minutes=minutes,
+        workers=workers,
+        scheduler=scheduler,
+        merging=merging_of(given),
+        localising=options.driving_of(given),
+        judge_at_m=given.build.max_gap_m,
+        estimator=given.build.estimator,
+    )
+    with interruptible(Bars()) as monitor:
+        report = look_for_better(
+            centre, handed or hand_ins_of(centre), validate, given.of_robot(), asked, monitor
+        )
+    if as_json:
+        print(json.dumps(report.to_dict()))
+    else:
+        typer.echo(report.text())

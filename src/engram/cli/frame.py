@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from engram.cli import options, outputs
-from engram.cli.progress import Bars
+from engram.cli import options
+from engram.cli.screen import Bars
 from engram.cli.wording import undo_text
 from engram.counts import counted
 
@@ -75,8 +75,7 @@ def anchor(
       engram anchor town.engram corners.csv --grid map.yaml --dry-run
     """
     from engram.cli.history import user
-    from engram.robot.anchoring import anchor_map
-    from engram.robot.islands import IslandReport, join_islands
+    from engram.robot.anchors import IslandReport, anchor_map, join_islands
 
     chosen, islands = settings.read(), IslandReport()
     report = anchor_map(
@@ -135,7 +134,7 @@ def goal(
 
     from engram.cli.history import user
     from engram.errors import InputError
-    from engram.robot.goals import add_goal, list_goals, remove_goal
+    from engram.robot.anchors import add_goal, list_goals, remove_goal
 
     if action is GoalAction.LIST:
         found = list_goals(map_path, at)
@@ -184,7 +183,7 @@ def export(
         typer.Argument(
             metavar="FILE",
             help="NAME.tum, .kitti, .csv or .geojson.",
-            parser=outputs.output_file,
+            parser=options.output_file,
         ),
     ],
     *,
@@ -208,7 +207,7 @@ def export(
       engram export town.engram town.csv
       engram export town.engram poses.txt --format tum
     """
-    from engram.robot.exporting import export_map
+    from engram.robot.inspecting import export_map
 
     wrote = export_map(map_path, out, None if form is None else form.value, at)
     if as_json:

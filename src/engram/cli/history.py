@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from engram.cli import options, outputs
+from engram.cli import options
 from engram.cli.wording import undo_text
 from engram.errors import ConfigError, RevisionError
 
@@ -109,7 +109,7 @@ def diff(
             "--picture",
             metavar="FILE",
             help="Draw what changed.",
-            parser=outputs.output_picture,
+            parser=options.output_picture,
         ),
     ] = None,
     as_json: options.Json = False,
@@ -124,8 +124,8 @@ def diff(
       engram diff town.engram 3 7
       engram diff town.engram winter head --picture changes.png
     """
-    from engram.maps import open_map
-    from engram.viewing.difference import draw_difference
+    from engram.maps.map import open_map
+    from engram.viewing.pictures import draw_difference
 
     with open_map(map_path) as town:
         found = town.diff(before, after, stretch)
@@ -156,8 +156,8 @@ def tag(
       engram tag town.engram
       engram tag town.engram winter --delete
     """
-    from engram.maps import open_map
     from engram.maps.history import map_tags, tag_dict
+    from engram.maps.map import open_map
 
     if name is None:
         _check_only_listing({"--delete": delete, "--move": move, "--message": bool(message)})

@@ -1,4 +1,4 @@
-"""`engram info`, `plot`, `check`, `amend`, `vocabulary`: what a map holds; is it sound."""
+"""`engram info`, `plot`, `view`, `check`, `amend`, `vocabulary`: what a map holds; is it sound."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from engram.cli import options, outputs
+from engram.cli import options
+from engram.cli.options import untrusted_if
 from engram.cli.wording import undo_text
 from engram.counts import counted
 
@@ -84,7 +85,7 @@ def plot(
     out: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE", help="The picture: .png, .svg, .pdf.", parser=outputs.output_picture
+            metavar="FILE", help="The picture: .png, .svg, .pdf.", parser=options.output_picture
         ),
     ],
     *,
@@ -107,7 +108,7 @@ def plot(
       engram plot town.engram hours.svg --by hour
       engram plot town.engram before.png --at 3 --by robot
     """
-    from engram.viewing.map_from_above import plot_map
+    from engram.viewing.pictures import plot_map
 
     drawn = plot_map(map_path, out, by.value, at)
     typer.echo(f"{out}: {counted(drawn, 'node')} by {by.value}")
@@ -135,7 +136,7 @@ def check(
             "--pictures",
             metavar="DIR",
             help="Draw both sides of those edges.",
-            parser=outputs.output_folder,
+            parser=options.output_folder,
         ),
     ] = None,
     settings: options.SettingsGiven,
@@ -155,7 +156,7 @@ def check(
       engram check town.engram --seal
       engram check town.engram --clean
     """
-    from engram.robot import check_map, seal_map
+    from engram.robot.inspecting import check_map, seal_map
 
     if geometry or repair:
         looked = _check_geometry(map_path, pictures, settings, commits=repair and yes)
@@ -186,8 +187,8 @@ def _check_geometry(
     map_path: Path, pictures: Path | None, settings: options.SettingsGiven, *, commits: bool
 ) -> GeometryReport:
     from engram.cli.history import user
-    from engram.cli.progress import Bars
-    from engram.repair import check_geometry
+    from engram.cli.screen import Bars
+    from engram.repair.repairing import check_geometry
 
     author = user() if commits else None
     chosen = settings.read()
@@ -252,7 +253,7 @@ def amend(
     from engram.errors import InputError
     from engram.graph.model import Amendable
     from engram.robot.inspecting import amend_session
-    from engram.sequences.options import parse_time
+    from engram.sequences.sequence import parse_time
 
     start_ns = parse_time("--recorded-at", recorded_at)
     given = {
@@ -307,9 +308,9 @@ def vocabulary(
       engram vocabulary show town.engram --json
     """
     from engram.cli.history import user
-    from engram.cli.progress import Bars
+    from engram.cli.screen import Bars
     from engram.errors import InputError
-    from engram.places import TrainingConfig
+    from engram.places.vocabulary import TrainingConfig
     from engram.robot.vocabularies import describe_vocabulary, train_map_vocabulary, use_vocabulary
 
     if action is VocabularyAction.SHOW:
@@ -340,3 +341,50 @@ def _plain(value: object) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key} {item}" for key, item in value.items()) or "none"
     return "none" if value is None else str(value)
+
+
+def view(
+    map_path: options.MapPath,
+    path: Annotated[
+        Path | None, typer.Argument(metavar="DRIVE", help="A drive to localise in the map.")
+    ] = None,
+    *,
+    view: options.Viewed = Path("window"),
+    at: options.At = None,
+    drive: options.Drive,
+    settings: options.SettingsGiven,
+) -> None:
+    """Look at a map, and at a drive in it.
+
+    Shows the map from above, coloured by experience. With a drive, or a file of the flight
+    recorder, it also shows the images with their inliers, the nodes that were tried, and the
+    robot's position and uncertainty. Needs the extra `view`.
+
+    \b
+    Examples:
+      engram view town.engram
+      engram view town.engram drives/tuesday
+      engram view town.engram drives/tuesday --view tuesday.rrd
+    """
+    from engram.cli.screen import Bars
+    from engram.maps.map import open_map
+    from engram.robot.starting import robot_on
+    from engram.viewing.viewer import WINDOW, viewer_on
+
+    with open_map(map_path, at) as opened, viewer_on(view) as viewer:
+        if path is None:
+            viewer.show(opened)
+        else:
+            sequence, given = drive.open(path), settings.read()
+            asked = options.driving_of(given)
+            with (
+                robot_on(opened, sequence, given.of_robot(), asked) as robot,
+                Bars().stage("view", len(sequence)) as monitor,
+            ):
+                viewer.watch(robot, opened)
+                for _ in robot.drive(sequence, monitor):
+                    pass
+        unfit = () if path is None else robot.unfit
+    if view != WINDOW:
+        typer.echo(f"wrote {view}; open it with: rerun {view}")
+    untrusted_if(unfit)

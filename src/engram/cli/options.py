@@ -1,4 +1,4 @@
-"""Options that several verbs share, and how a verb takes a group of them."""
+"""What verbs share: options, help, where they write, and how they may end."""
 
 from __future__ import annotations
 
@@ -6,22 +6,93 @@ import dataclasses
 import functools
 import inspect
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
+from typer.core import TyperCommand
 
-from engram.cli.help import LAYOUTS
-from engram.errors import InputError, SequenceError
-from engram.files import check_there, map_path
+from engram.errors import EngramError, InputError, SequenceError
+from engram.files import check_output, check_output_folder, check_there, map_path
 
 if TYPE_CHECKING:
     from engram.cli.settings import AllSettings
-    from engram.robot import RobotOptions
+    from engram.doctor.table import Finding
+    from engram.robot.settings import RobotOptions
     from engram.sequences.opening import Drive as OpenDrive
-    from engram.sequences.options import OpenOptions
+    from engram.sequences.sequence import OpenOptions
+
+
+# In an option's help: the names of all layouts, which only the help itself is worth importing for.
+LAYOUTS = "LAYOUTS"
+# Widest first column of a table; a longer one has its meaning on the next line.
+_COLUMN = 27
+
+
+class Verb(TyperCommand):
+    """A verb whose help names the options that few drives need without explaining them."""
+
+    # Where those are explained.
+    _EXPLAINED = "Also for drives, explained by engram drive info --help"
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """The arguments in the line of usage."""
+        del ctx
+        arguments = [_typed(one) for one in self.params if one.param_type_name == "argument"]
+        return [self.options_metavar or "", *arguments]
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Tables of arguments and options, and the names of the options that are not explained."""
+        arguments, options, others = [], [], []
+        for one in self.get_params(ctx):
+            if one.param_type_name == "argument":
+                arguments.append((_typed(one), _meaning(one, ctx)))
+            elif self._explains(one):
+                options.append((one, ctx))
+            else:
+                others.append(one.opts[0])
+        if arguments:
+            with formatter.section("Arguments"):
+                formatter.write_dl(arguments, col_max=_COLUMN)
+        with formatter.section("Options"):
+            formatter.write_dl([_record(*one) for one in options], col_max=_COLUMN)
+        if others:
+            with formatter.section(self._EXPLAINED):
+                formatter.write_text(" ".join(others))
+
+    def _explains(self, option: Any) -> bool:
+        return not option.hidden
+
+
+class VerbInFull(Verb):
+    """A verb whose help explains those options, too."""
+
+    def _explains(self, option: Any) -> bool:
+        option.hidden = False
+        return True
+
+
+def _typed(argument: Any) -> str:
+    """How an argument is typed: MAP, [REV], DRIVE..."""
+    name = argument.metavar or argument.name.upper()
+    many = "..." if argument.nargs != 1 else ""
+    return f"{name}{many}" if argument.required else f"[{name}]{many}"
+
+
+def _meaning(argument: Any, ctx: Any) -> str:
+    return _record(argument, ctx)[1].removesuffix("[required]").rstrip()  # usage says so
+
+
+def _record(parameter: Any, ctx: Any) -> tuple[str, str]:
+    typed, meaning = parameter.get_help_record(ctx)
+    if LAYOUTS in meaning:
+        from engram.sequences.opening import layout_names
+
+        meaning = meaning.replace(LAYOUTS, ", ".join(layout_names()))
+    return typed, " ".join(meaning.split()).replace("]. [", "; ")
 
 
 def map_file(text: str) -> Path:
@@ -211,7 +282,7 @@ class Drive:
 
     def options(self) -> OpenOptions:
         """How it is opened; see `OpenOptions` for the errors."""
-        from engram.sequences.options import (
+        from engram.sequences.sequence import (
             Channel,
             FrameRange,
             OpenOptions,
@@ -299,7 +370,7 @@ class Effort:
 
 def driving_of(settings: AllSettings) -> RobotOptions:
     """How a robot drives by the settings alone."""
-    from engram.robot import RobotOptions
+    from engram.robot.settings import RobotOptions
 
     return RobotOptions(**Effort().over(settings))
 
@@ -357,3 +428,138 @@ def _options_of(group: Any) -> list[inspect.Parameter]:
         )
         for one in dataclasses.fields(group)
     ]
+
+
+class OutputError(EngramError):
+    """The output of a verb cannot be written to its path."""
+
+
+def _refusing(check: Callable[[str], Path]) -> Callable[[str], Path]:
+    """The check as the parser of an argument or option."""
+
+    def parse(text: str) -> Path:
+        try:
+            return check(text)
+        except EngramError as error:
+            # No ValueError: Typer would make a page of usage of it.
+            raise OutputError(str(error)) from error
+
+    return parse
+
+
+def _file(text: str) -> Path:
+    check_output(Path(text))
+    return Path(text)
+
+
+def _picture(text: str) -> Path:
+    from engram.viewing.pictures import check_picture
+
+    check_picture(Path(text))
+    return Path(text)
+
+
+def _folder(text: str) -> Path:
+    check_output_folder(Path(text))
+    return Path(text)
+
+
+def _map(text: str) -> Path:
+    path = map_file(text)
+    check_output(path)
+    return path
+
+
+def _fleet_map(text: str) -> Path:
+    """One that is there may be only looked at (`merge --dry-run`)."""
+    path = map_file(text)
+    return path if path.is_file() else _map(text)
+
+
+def _recording(text: str) -> Path:
+    return Path(text) if text == "window" else _file(text)
+
+
+output_file = _refusing(_file)
+output_picture = _refusing(_picture)
+output_folder = _refusing(_folder)
+output_map = _refusing(_map)
+output_fleet_map = _refusing(_fleet_map)
+output_recording = _refusing(_recording)
+
+WrittenMap: TypeAlias = Annotated[
+    Path, typer.Argument(metavar="MAP", help="A map, NAME.engram.", parser=output_map)
+]
+WrittenFleetMap: TypeAlias = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FLEET",
+        help="The fleet map; created if it does not exist.",
+        parser=output_fleet_map,
+    ),
+]
+_VIEW = typer.Option(
+    "--view",
+    metavar="window|FILE.rrd",
+    help="Watch it in Rerun, or write a recording.",
+    parser=output_recording,
+)
+View: TypeAlias = Annotated[Path | None, _VIEW]
+Viewed: TypeAlias = Annotated[Path, _VIEW]
+
+
+class ExitStatus(IntEnum):
+    """How a verb ended, for scripts. `docs/commands.md` has the same table."""
+
+    meaning: str
+
+    def __new__(cls, value: int, meaning: str) -> ExitStatus:
+        """A status with what it means."""
+        one = int.__new__(cls, value)
+        one._value_ = value
+        one.meaning = meaning
+        return one
+
+    DONE = 0, "done"
+    DAMAGED_MAP = 1, "`check` found damage, or wrong edges"
+    BAD_INPUT = 2, "the input cannot be used; one line says why and what to do"
+    LOST_PARTS = 3, "parts of a drive were lost, by damage or wrong stamps; the rest was used"
+    UNFIT_DRIVE = 4, "the drive has a fatal fault: `doctor` found it, or `map` refused it"
+    NOT_TO_BE_TRUSTED = (
+        5,
+        "`localise`, `live`, `record` and `view` did it, but the drive has a fatal fault: do not "
+        "trust the result",
+    )
+    INTERRUPTED = 130, "interrupted"
+    READER_LEFT = 141, "the reader closed the output"  # as of a program that SIGPIPE ends
+
+
+def untrusted_if(fatal: Sequence[Finding]) -> None:
+    """Ends a verb that finished its work on an unfit drive.
+
+    Raises:
+        Exit: the doctor found something fatal; stderr says what.
+    """
+    if not fatal:
+        return
+    for one in fatal:
+        typer.echo(f"not to be trusted: {one.text()}", err=True)
+    raise typer.Exit(ExitStatus.NOT_TO_BE_TRUSTED)
+
+
+class VerbInterruptedError(Exception):
+    """A verb was stopped by Ctrl-C before it had a result."""
+
+
+class PartlyDoneError(Exception):
+    """A verb failed or was stopped after part of its work was committed.
+
+    Attributes:
+        error: what ended it.
+        done: what ``--json`` prints of the committed part, in addition to the error.
+    """
+
+    def __init__(self, error: EngramError | VerbInterruptedError, done: Mapping[str, Any]) -> None:
+        super().__init__(str(error))
+        self.error = error
+        self.done = done

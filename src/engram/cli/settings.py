@@ -17,14 +17,14 @@ from msgspec import Meta
 from engram.config import check_bounds, from_dict, read_toml, to_dict
 from engram.errors import ConfigError
 from engram.fleet.merge.settings import MergeSettings
-from engram.frontend import DescriptorKind
+from engram.frontend.frame import DescriptorKind
 from engram.measures import Estimator
-from engram.repair.config import RepairConfig
-from engram.robot.islands import IslandsConfig
+from engram.repair.finding import RepairConfig
+from engram.robot.anchors import IslandsConfig
 from engram.robot.settings import Settings, settings_text
 
 if TYPE_CHECKING:
-    from engram.fleet.download import DownloadOptions
+    from engram.fleet.download.mission import DownloadOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +105,7 @@ class DownloadSettings:
 
     def options(self, select: str, **mission: Any) -> DownloadOptions:
         """What to download by these settings; see `DownloadOptions` for what a mission is."""
-        from engram.fleet.download import DownloadOptions
+        from engram.fleet.download.mission import DownloadOptions
 
         own = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
         return DownloadOptions(select, **{**own, **mission})

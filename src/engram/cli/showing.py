@@ -1,4 +1,4 @@
-"""`engram settings`: what can be set, and to what it is set."""
+"""`engram settings` and `engram features`: what can be set, and the kinds of features."""
 
 from __future__ import annotations
 
@@ -51,3 +51,62 @@ def settings(
     for one in every_setting(resolved):
         words = one.comment
         typer.echo(f"{one.key} = {json.dumps(one.value)}" + (f"  # {words}" if words else ""))
+
+
+class FeaturesAction(StrEnum):
+    """What to do with the kinds."""
+
+    LIST = "list"
+    CHECK = "check"
+
+
+def features(
+    action: Annotated[
+        FeaturesAction, typer.Argument(metavar="ACTION", help="list or check.")
+    ] = FeaturesAction.LIST,
+    kinds: Annotated[
+        list[str] | None, typer.Argument(metavar="KIND", help="Kinds of features [default: all].")
+    ] = None,
+    *,
+    as_json: options.Json = False,
+) -> None:
+    """List the kinds of features, or check them.
+
+    Every map and frame log uses one kind, and only the same kind matches; a learned kind also names
+    its model. Installed packages may add kinds; `check` tests whether a kind does what every kind
+    must.
+
+    \b
+    Examples:
+      engram features list
+      engram features check net
+    """
+    from engram.frontend.features import feature_kind, known_kinds
+    from engram.testing.contracts import check_kind
+
+    asked = [feature_kind(name) for name in kinds] if kinds else known_kinds()
+    if action is FeaturesAction.LIST:
+        listed = [
+            {"kind": one.name, "bits": 8 * one.descriptor_bytes, "good_at": one.good_at}
+            for one in asked
+        ]
+        if as_json:
+            print(json.dumps({"kinds": listed}))
+            return
+        for row in listed:
+            typer.echo(f"{row['kind']:14} {row['bits']} bits  {row['good_at']}".rstrip())
+        typer.echo(
+            "a map keeps the kind it is made with: engram map NEW.engram DRIVE --features KIND"
+        )
+        return
+    found = {one.name: check_kind(one) for one in asked}
+    if as_json:
+        rows = {name: [[c.demand, c.met, c.found] for c in part] for name, part in found.items()}
+        print(json.dumps({"checks": rows}))
+    else:
+        for name, part in found.items():
+            for one in part:
+                mark = "ok    " if one.met else "FAILED"
+                typer.echo(f"{name:14} {mark} {one.demand}: {one.found}")
+    if not all(one.met for part in found.values() for one in part):
+        raise typer.Exit(1)

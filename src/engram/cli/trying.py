@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from engram.cli import outputs
-from engram.cli.endings import ExitStatus, VerbInterruptedError
+from engram.cli import options
+from engram.cli.options import ExitStatus, VerbInterruptedError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -52,7 +52,7 @@ def try_(
             "--out",
             metavar="FOLDER",
             help="Folder for drives, map and pictures.",
-            parser=outputs.output_folder,
+            parser=options.output_folder,
         ),
     ] = Path("engram-try"),
     drives_only: Annotated[
@@ -79,8 +79,8 @@ def try_(
 
 
 def _write_drives(out: Path) -> None:
-    from engram.cli.progress import Bars
-    from engram.sample import DRIVES, write_drives
+    from engram.cli.screen import Bars
+    from engram.sample.drives import DRIVES, write_drives
 
     write_drives(out, Bars())
     typer.echo("Two drives of one street by one robot. They are simulated:")
@@ -142,7 +142,7 @@ def _run(ctx: typer.Context, step: Step) -> int:
 
 def _end(out: Path) -> None:
     """How right it was, what to look at, and what comes next."""
-    from engram.sample import offsets_m
+    from engram.sample.drives import offsets_m
 
     street = out / "street.engram"
     typer.echo(f"\n{_how_right(offsets_m(street, out))}")

@@ -96,7 +96,7 @@ def _frames(summary: Mapping[str, Any]) -> list[str]:
 
 def warnings(summary: Mapping[str, Any]) -> list[str]:
     """What people should look into before they trust a summary; for stderr."""
-    from engram.doctor import measure_text
+    from engram.doctor.table import measure_text
 
     lines = []
     if damaged := summary["damaged_nodes"]:

@@ -2,28 +2,106 @@
 
 All other code takes the width of a descriptor from this table. Another package adds a kind by an
 entry point of the group `engram.features` that names a `FeatureKind`.
+
+The kind of features `net`: descriptors by a small network, with some of BRIEF's bits. A patch of
+48×48 px around each corner goes through three convolutions and a linear layer in 8-bit integers,
+whose signs are 192 bits. Light, season and weather change them far less than BRIEF; rain and small
+rooms favour BRIEF, of which 64 bits are added.
+
+Corners that the left and the right image share, wherever they lie. The front-end searches along the
+row and to the left only, as a calibrated pair demands. Here nothing is demanded, so that what is
+wrong with a pair shows.
 """
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field, fields, replace
+from functools import cache
+from importlib import resources
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors.numpy import load
 
 from engram import _core
 from engram.errors import ConfigError, IncompatibleError
-from engram.frontend import network
 from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind, StereoPair
 from engram.frontend.matching import MatcherConfig
 from engram.frontend.opencv_contrib import xfeatures2d
 from engram.plugins import PluginGroup, check_is
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from engram.frontend.frontend import FrontendConfig
 
-NET = DescriptorKind(f"net@{network.MODEL}")
+
+# The first eight hexadecimal digits of the SHA-256 of its weights. Part of the kind's name in maps
+# and frame logs, so that descriptors of two models never meet.
+MODEL = "595cbcd3"
+NETWORK_BITS, BRIEF_BITS = 192, 64
+
+_FILE = "net.safetensors"
+_ARRAYS = (
+    "first",
+    "second",
+    "third",
+    "linear",
+    "first_scaling",
+    "second_scaling",
+    "third_scaling",
+    "thresholds",
+    "shifts",
+)
+
+
+def weights() -> Mapping[str, NDArray[Any]]:
+    """The arrays of `engram._core.PatchNetwork`, by the names of its arguments.
+
+    Four (out, side, side, in) int8 layers of weights; the rest int32, (n,) factors and limits.
+
+    Raises:
+        IncompatibleError: the installed file is not the model that this version names.
+    """
+    body = (resources.files("engram.frontend") / "data" / _FILE).read_bytes()
+    found = hashlib.sha256(body).hexdigest()[: len(MODEL)]
+    if found != MODEL:
+        raise IncompatibleError(
+            f"the installed weights {_FILE} are model {found}, must be {MODEL}; "
+            "install Engram again"
+        )
+    arrays: Mapping[str, NDArray[Any]] = load(body)
+    return arrays
+
+
+@cache
+def network() -> _core.PatchNetwork:
+    """The network, read once."""
+    arrays = weights()
+    return _core.PatchNetwork(**{name: arrays[name] for name in _ARRAYS})
+
+
+def beside_brief(
+    image: NDArray[np.uint8],
+    pixels: NDArray[np.float32],
+    octaves: NDArray[np.uint8],
+    brief: NDArray[np.uint8],
+) -> NDArray[np.uint8]:
+    """The network's bits and the first of BRIEF's: descriptors (N, 32) uint8.
+
+    Args:
+        image: (h, w) uint8 grey.
+        pixels: (N, 2) float32 u, v, px.
+        octaves: (N,) uint8.
+        brief: (N, 32) uint8, BRIEF-256 of the same points.
+    """
+    found = network().describe(image, pixels, octaves)
+    return np.concatenate([found, brief[:, : BRIEF_BITS // 8]], axis=1)
+
+
+NET = DescriptorKind(f"net@{MODEL}")
 
 # OpenCV's TEBLID takes the patch from keypoint size × scale factor; 7 and 5 suit corners without a
 # size best.
@@ -192,7 +270,7 @@ def detect_corners_with_net(pair: StereoPair, config: FrontendConfig, landmarks:
     """`detect_corners` and `describe_net`."""
     found = detect_corners_with_brief(pair, config, landmarks)
     assert found.descriptors is not None, "BRIEF comes with the corners"
-    described = network.beside_brief(pair.left, found.pixels, found.octaves, found.descriptors)
+    described = beside_brief(pair.left, found.pixels, found.octaves, found.descriptors)
     return replace(found, descriptors=described)
 
 
@@ -201,7 +279,7 @@ def describe_net(
 ) -> NDArray[np.uint8]:
     """192 bits of the network with 64 of BRIEF: (N, 32) uint8. For arguments see `Describe`."""
     brief = describe_brief(image, pixels, octaves)
-    return network.beside_brief(image, pixels, octaves, brief)
+    return beside_brief(image, pixels, octaves, brief)
 
 
 FEATURES: dict[DescriptorKind, FeatureKind] = {
@@ -309,3 +387,58 @@ def fitted_matcher(
         if any(getattr(matcher, name) == getattr(one, name) for one in untouched)
     }
     return replace(matcher, **changes)
+
+
+Array = NDArray[np.float64]
+
+_CORNERS = 400
+_FAST_THRESHOLD = 7
+_CELL_PX = 32
+# Most different bits of a BRIEF descriptor of 256: a random pair differs in 128 ± 8.
+_MOST_BITS = 64
+_RATIO = 0.85
+# Vertical offsets further than this from the usual one are wrong matches.
+_WRONG_PX = 40.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SideMatches:
+    """Corners that both images show.
+
+    Attributes:
+        pixels: (M, 2) float64, left u, v, px.
+        shift: (M, 2) float64, left minus right u and v, px: disparity and vertical offset.
+    """
+
+    pixels: Array
+    shift: Array
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+def match_sides(pair: StereoPair) -> SideMatches:
+    """Mutually nearest corners of a pair, the wrong ones mostly removed."""
+    (left, of_left), (right, of_right) = _best_corners(pair.left), _best_corners(pair.right)
+    if min(len(left), len(right)) < 2:
+        return SideMatches(np.zeros((0, 2)), np.zeros((0, 2)))
+    bits = _core.hamming_matrix(of_left, of_right)
+    nearest = bits.argmin(axis=1)
+    rows = np.arange(len(left))
+    best = bits[rows, nearest].astype(np.float64)
+    bits[rows, nearest] = 999
+    kept = (best <= _MOST_BITS) & (best < _RATIO * bits.min(axis=1))
+    bits[rows, nearest] = best
+    kept &= bits.argmin(axis=0)[nearest] == rows
+    pixels, shift = left[kept], left[kept] - right[nearest[kept]]
+    near = np.abs(shift[:, 1] - np.median(shift[:, 1])) < _WRONG_PX if len(shift) else kept[:0]
+    return SideMatches(pixels[near], shift[near])
+
+
+def _best_corners(image: NDArray[np.uint8]) -> tuple[Array, NDArray[np.uint8]]:
+    """The best corners of each cell, (N, 2) px, with their descriptors (N, 32)."""
+    positions, scores, offsets = _core.detect_corners(image, _FAST_THRESHOLD)
+    height, width = image.shape
+    best = _core.order_corners(positions, scores, width, height, _CELL_PX)[:_CORNERS]
+    described = _core.describe(_core.smooth(image), np.ascontiguousarray(positions[best]))
+    return positions[best].astype(np.float64) + offsets[best], described

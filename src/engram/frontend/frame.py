@@ -9,7 +9,7 @@ from typing import NewType
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.geometry import StereoCamera
+from engram.geometry.cameras import StereoCamera
 
 # Key in `FEATURES`. Different kinds never match.
 DescriptorKind = NewType("DescriptorKind", str)

@@ -22,7 +22,7 @@ from engram import _core
 from engram.config import check_bounds, config_hash
 from engram.errors import IncompatibleError, InputError
 from engram.frontend.frame import Frame
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 
 # Part of `matcher_hash`: raise it when the kernels give different results for equal settings.
 _VERSION = 4

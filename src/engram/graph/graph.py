@@ -1,4 +1,4 @@
-"""The experience graph in memory: nodes, edges, and the search for what is near."""
+"""The graph of a map: nodes, edges and components, also while it grows."""
 
 from __future__ import annotations
 
@@ -6,23 +6,169 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
 from engram.errors import InputError
-from engram.geometry import SE3
-from engram.graph.chain_error import ChainError, edge_error_rows, error_rows_of
-from engram.graph.components import labels_of
-from engram.graph.edge_table import EDGE_KINDS, EdgeRecords, EdgeTable
-from engram.graph.growing import Column
+from engram.geometry.se3 import SE3
+from engram.graph.basin import ChainError, edge_error_rows, error_rows_of
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.graph.neighbourhood import Neighbourhood, Search
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
+
+
+EDGE_KINDS = tuple(EdgeKind)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeTable(Sequence[Edge]):
+    """Edges between nodes of a list, each key (a, b, kind) once.
+
+    Attributes:
+        nodes: the nodes.
+        ends: (E, 2) int32, places of a and b in `nodes`.
+        kinds: (E,) uint8, index into `EDGE_KINDS`.
+        poses: (E, 12) float64, ``a_from_b``: rotation in row-major order, then translation in m.
+        covariances: (E, 6, 6) float64 of ``a_from_b``, left perturbation, m and rad.
+    """
+
+    nodes: Sequence[Node]
+    ends: NDArray[np.int32]
+    kinds: NDArray[np.uint8]
+    poses: NDArray[np.float64]
+    covariances: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+    @overload
+    def __getitem__(self, index: int) -> Edge: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Edge]: ...
+    def __getitem__(self, index: int | slice) -> Edge | list[Edge]:
+        if isinstance(index, slice):
+            return [self[at] for at in range(*index.indices(len(self)))]
+        a, b = self.ends[index].tolist()
+        pose = self.poses[index]
+        return Edge(
+            self.nodes[a].id,
+            self.nodes[b].id,
+            EDGE_KINDS[self.kinds[index]],
+            SE3(pose[:9].reshape(3, 3), pose[9:]),
+            self.covariances[index],
+        )
+
+
+class EdgeRecords(Sequence[Edge]):
+    """The edges of a graph: those of one table, made on first use and kept, and later ones."""
+
+    def __init__(self) -> None:
+        self._table: Sequence[Edge] = ()
+        self._known: list[Edge | None] = []
+
+    def begin_with(self, table: EdgeTable) -> None:
+        """Takes the edges of a table; there are no others yet."""
+        assert not self._known
+        self._table, self._known = table, [None] * len(table)
+
+    def append(self, edge: Edge) -> None:
+        """Adds an edge."""
+        self._known.append(edge)
+
+    def extend(self, edges: Sequence[Edge]) -> None:
+        """Adds edges."""
+        self._known.extend(edges)
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+    def __setitem__(self, index: int, edge: Edge) -> None:
+        self._known[index] = edge
+
+    @overload
+    def __getitem__(self, index: int) -> Edge: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Edge]: ...
+    def __getitem__(self, index: int | slice) -> Edge | list[Edge]:
+        if isinstance(index, slice):
+            return [self[at] for at in range(*index.indices(len(self)))]
+        known = self._known[index]
+        if known is None:
+            known = self._known[index] = self._table[index]
+        return known
+
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+
+class Column(Generic[Scalar]):
+    """Rows of one shape and dtype that can be appended to.
+
+    `rows` is a view. A view taken before an append keeps its length, and may keep showing the old
+    rows after the storage has moved.
+    """
+
+    __slots__ = ("_count", "_storage")
+
+    def __init__(self, dtype: type[Scalar], row_shape: tuple[int, ...] = ()) -> None:
+        self._storage: NDArray[Scalar] = np.zeros((16, *row_shape), dtype=dtype)
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def rows(self) -> NDArray[Scalar]:
+        """All rows, (N, *row_shape)."""
+        return self._storage[: self._count]
+
+    def append(self, row: Any) -> None:
+        """Add one row."""
+        if self._count == len(self._storage):
+            grown = np.zeros((2 * self._count, *self._storage.shape[1:]), self._storage.dtype)
+            grown[: self._count] = self._storage
+            self._storage = grown
+        self._storage[self._count] = row
+        self._count += 1
+
+    def extend(self, rows: NDArray[Scalar]) -> None:
+        """Add (M, *row_shape) rows."""
+        count = self._count + len(rows)
+        if count > len(self._storage):
+            room = max(count, 2 * len(self._storage))
+            grown = np.zeros((room, *self._storage.shape[1:]), self._storage.dtype)
+            grown[: self._count] = self.rows
+            self._storage = grown
+        self._storage[self._count : count] = rows
+        self._count = count
+
+
+Indices = NDArray[np.int64]
+
+
+def labels_of(ends: NDArray[np.integer], count: int) -> Indices:
+    """(N,) int64: the component of each node by (E, 2) ends, numbered by first node."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    labels = connected_components(links, directed=False)[1]
+    return np.asarray(labels, dtype=np.int64)
+
+
+def grouped(labels: NDArray[np.integer]) -> list[Indices]:
+    """The indices of each of (N,) labels, increasing; labels in the order of their first index."""
+    if not len(labels):
+        return []
+    order = np.argsort(labels, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
+    return sorted(groups, key=lambda group: int(group[0]))
+
 
 # From so many edges on they are linked by arrays; a mapper adds a few at a time.
 _BULK = 16

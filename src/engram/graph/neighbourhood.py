@@ -10,7 +10,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram.config import check_bounds
-from engram.graph.chain_error import PivotedError
+from engram.graph.basin import PivotedError
 from engram.graph.model import SessionId
 
 

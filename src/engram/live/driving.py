@@ -1,4 +1,4 @@
-"""The robot of a live process: its map is opened with the first frame, and again after errors."""
+"""One live drive: frames and motion in, results out."""
 
 from __future__ import annotations
 
@@ -11,24 +11,60 @@ from typing import Protocol
 
 import numpy as np
 
-from engram.doctor.findings import Finding
+from engram.doctor.table import Finding
 from engram.errors import EngramError, InputError
-from engram.frontend import DescriptorKind, StereoPair
-from engram.geometry import SE3, StereoCamera
-from engram.live.outside import Outside
-from engram.localiser import Localisation, LocalisationStatus, Position
-from engram.maps import Map, open_map
-from engram.odometry import Motion, OutsideMotion
-from engram.robot.fixed import ToldFix
+from engram.frontend.frame import DescriptorKind, StereoPair
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+from engram.localiser.localisation import Localisation, LocalisationStatus, Position
+from engram.maps.map import Map, open_map
+from engram.odometry.motion import Motion
+from engram.odometry.outside import OutsideMotion
+from engram.robot.anchors import ToldFix
 from engram.robot.front import Arrived, Front, at_time, stamp_of
-from engram.robot.live import Owner
-from engram.robot.robot import Robot
-from engram.robot.saved import Saving, SavingState
+from engram.robot.live import Owner, Saving, SavingState
+from engram.robot.robot import Robot, Whereabouts
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_in
-from engram.robot.whereabouts import Whereabouts
 from engram.sequences.bags.fixes import Fix
 from engram.sequences.clocks import SteadyClock
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outside:
+    """Where wheels and gyroscope see the camera; what counts is how it changes.
+
+    Attributes:
+        wheels_from_live: its pose by wheel odometry, in a frame that stays; None without wheels.
+        gyro_from_live: its rotation by a gyroscope, in a frame that stays, as a pose without a
+            translation; None without one. It replaces the rotation of the wheels.
+    """
+
+    wheels_from_live: SE3 | None = None
+    gyro_from_live: SE3 | None = None
+
+    def since(self, before: Outside, seconds: float) -> OutsideMotion | None:
+        """The motion since an earlier frame by what was there at both; None for nothing.
+
+        Frames that repeat a stamp, or go back, measure nothing: there is no rate without time.
+
+        The bias is still in it. What wheels measure at the camera holds the turn of its mounting
+        by the wheels: the error is the length of the mounting times that of the turn.
+        """
+        if seconds <= 0:
+            return None
+        wheels = _between(before.wheels_from_live, self.wheels_from_live)
+        gyro = _between(before.gyro_from_live, self.gyro_from_live)
+        if gyro is None:
+            return None if wheels is None else OutsideMotion(wheels, seconds)
+        way = np.zeros(3) if wheels is None else wheels.translation
+        rates_rad_s = gyro.log()[3:] / seconds
+        return OutsideMotion(SE3(gyro.rotation, way), seconds, wheels is not None, rates_rad_s)
+
+
+def _between(before: SE3 | None, after: SE3 | None) -> SE3 | None:
+    return None if before is None or after is None else before.inverse() @ after
+
 
 # Between attempts to open a map that cannot be opened.
 _AGAIN_AFTER_S = 2.0

@@ -1,19 +1,89 @@
-"""Acceptance of a match: the cheap second half of an attempt (method §3.2)."""
+"""When a match is accepted: inliers, their spread over the image, the lens.
+
+Nodes as a camera with another lens sees them best: from farther behind, or farther ahead. A longer
+lens shows the same scene larger. A live frame is most alike a node of a shorter lens where it
+stands behind it, so that both show the scene at one scale. The offset grows with the ratio of the
+focal lengths and the usual depth of what matches.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engram.errors import ConfigError
+from engram.frontend.frame import Frame
 from engram.frontend.matching import Match
-from engram.geometry import SE3
+from engram.geometry.cameras import CameraId, StereoCamera
+from engram.geometry.se3 import SE3
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import Session, SessionId
 from engram.graph.neighbourhood import Neighbourhood
-from engram.localiser.spread import Spread
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Extent of a match's inliers, from their 10th to their 90th percentile.
+
+    Attributes:
+        image: share of the image: geometric mean of the shares of its width and its height.
+        height: extent along the camera's y axis, as a share of that of all landmarks of the frame.
+        depth_m: median depth in front of the camera, metres.
+    """
+
+    image: float
+    height: float
+    depth_m: float
+
+
+def inlier_spread(match: Match, reference: Frame, live: Frame) -> Spread:
+    """The extent of a match's inliers; of each measure, the smaller of the two frames."""
+    if match.inliers == 0:
+        return Spread(0.0, 0.0, 0.0)
+    spreads = []
+    for frame, rows in ((reference, match.reference_rows), (live, match.live_rows)):
+        size = (frame.camera.width, frame.camera.height)
+        width, height = _extent(frame.landmarks.pixels[rows] / size).tolist()
+        height_m = frame.landmarks.points_in_cam[:, 1]
+        whole_m = max(float(_extent(height_m)), np.finfo(np.float64).tiny)
+        share = float(_extent(height_m[rows])) / whole_m
+        depth_m = _median(frame.landmarks.points_in_cam[rows, 2])
+        spreads.append((math.sqrt(width * height), share, depth_m))
+    return Spread(*(min(values) for values in zip(*spreads, strict=True)))
+
+
+def _extent(values: NDArray[np.floating]) -> NDArray[np.floating]:
+    """From the 10th to the 90th percentile, along the first axis.
+
+    As `np.percentile` has it, to the bit, in a tenth of its time.
+    """
+    ordered = np.sort(values, axis=0)
+    extent: NDArray[np.floating] = _percentile(ordered, 90) - _percentile(ordered, 10)
+    return extent
+
+
+def _median(values: NDArray[np.floating]) -> float:
+    """As `np.median` has it, to the bit, in a fifth of its time."""
+    ordered = np.sort(values)
+    middle = len(ordered) // 2
+    odd = len(ordered) % 2
+    return float(ordered[middle] if odd else (ordered[middle - 1] + ordered[middle]) / 2)
+
+
+def _percentile(ordered: NDArray[np.floating], percent: int) -> NDArray[np.floating]:
+    place = percent / 100 * (len(ordered) - 1)
+    below = math.floor(place)
+    low, high = ordered[below], ordered[min(below + 1, len(ordered) - 1)]
+    share = np.float64(place - below)
+    value: NDArray[np.floating] = (
+        high - (high - low) * (1 - share) if share >= 0.5 else low + (high - low) * share
+    )
+    return value
 
 
 class Rule(StrEnum):
@@ -191,3 +261,53 @@ def determined(match: Match, config: AcceptanceConfig) -> bool:
     assert match.covariance is not None
     x, y, z = match.covariance.diagonal()[:3].tolist()
     return bool(x + y + z <= config.max_sigma_m**2)
+
+
+class Lenses:
+    """The focal lengths of a map's drives, compared with that of the live camera.
+
+    Args:
+        graph: the experience graph; it may grow.
+        sessions, cameras: of the map.
+        focal_px: of the live camera, which saves whatever is not in the map yet.
+        depth_m: usual depth of what matches; 0 turns the correction off.
+    """
+
+    def __init__(
+        self,
+        graph: ExperienceGraph,
+        sessions: Mapping[SessionId, Session],
+        cameras: Mapping[CameraId, StereoCamera],
+        focal_px: float,
+        depth_m: float,
+    ) -> None:
+        self._graph = graph
+        self._sessions, self._cameras = sessions, cameras
+        self._focal_px, self._depth_m = focal_px, depth_m
+        self._of_session = np.zeros(0)
+        self._alike = True  # whether none of them shifts
+
+    def shifts_m(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
+        """(Y,) metres along the viewing direction at which nodes are most alike the live view."""
+        self._look_at_sessions()
+        return self._of_session[self._graph.sessions_of(nodes)]
+
+    def _look_at_sessions(self) -> None:
+        while len(self._of_session) < self._graph.session_count:
+            session = self._sessions.get(self._graph.session(len(self._of_session)))
+            camera = None if session is None else self._cameras.get(session.camera)
+            shift_m = 0.0
+            if camera is not None:
+                shift_m = self._depth_m * (1 - self._focal_px / camera.fx)
+            self._of_session = np.append(self._of_session, shift_m)
+            self._alike = self._alike and not shift_m
+
+    def as_seen(self, near: Neighbourhood) -> Neighbourhood:
+        """Candidates with their offsets as by one lens; the very same if all lenses are."""
+        self._look_at_sessions()
+        if self._alike or not (shifts_m := self.shifts_m(near.nodes)).any():
+            return near
+        along_m = near.along_m - shifts_m
+        height_m = near.node_from_live[:, 1, 3]
+        distance_m = np.sqrt(along_m**2 + near.across_m**2 + height_m**2)
+        return replace(near, along_m=along_m, distance_m=distance_m)

@@ -21,9 +21,9 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from engram.frontend import BRIEF, DescriptorKind
 from engram.frontend.features import NET
-from engram.localiser.spread import Spread
+from engram.frontend.frame import BRIEF, DescriptorKind
+from engram.localiser.acceptance import Spread
 
 # Number of fixes that show how many inliers are usual.
 _USUAL_OF = 20

@@ -1,63 +1,123 @@
-"""The localiser: live frame + map + policy + budget → `Localisation` (method §3, [L15] §III)."""
+"""The localiser: its inputs, and the one step from a frame to a position (method §3)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
 from typing import Self
+from uuid import uuid5
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import Frame, FrameStatus
-from engram.graph.breadth_first import breadth_first
-from engram.graph.clock import day_of, hour_of_day
+from engram.frontend.frame import Frame, FrameStatus
+from engram.graph.basin import MatchBasin
+from engram.graph.clock import Clocked, day_of, hour_of_day
 from engram.graph.graph import ExperienceGraph
-from engram.graph.model import Attempt, NodeId, Session, node_id, path_id
+from engram.graph.model import (
+    ENGRAM_NAMESPACE,
+    Attempt,
+    LandmarkSource,
+    NodeId,
+    Session,
+    SessionId,
+    node_id,
+    path_id,
+)
 from engram.graph.neighbourhood import Neighbourhood, Search
-from engram.localiser.acceptance import Prediction, Rule
+from engram.graph.paths import PathMemory
+from engram.graph.proximity import breadth_first
+from engram.localiser.acceptance import Lenses, Prediction, Rule
 from engram.localiser.attempts import (
     Attempter,
     Candidate,
     Matcher,
     Outcome,
+    Tried,
     alternate,
+    best_success,
     split_at_first_success,
+    uncontested,
 )
-from engram.localiser.choice import best_success, uncontested
 from engram.localiser.confidence import confidence_of
-from engram.localiser.fusing import Track
-from engram.localiser.given import InForce, LiveDrive, MapParts
-from engram.localiser.hypotheses import Hypotheses
-from engram.localiser.keeper import KEEPS_NOTHING, Keeper
-from engram.localiser.lenses import Lenses
 from engram.localiser.localisation import (
+    KEEPS_NOTHING,
     Budget,
+    Keeper,
     Localisation,
     LocalisationStatus,
     Position,
     StageClock,
 )
-from engram.localiser.proving import Prover
-from engram.localiser.relocalisation import Relocaliser
-from engram.localiser.settings import (
-    LocaliserConfig,
-    NeighbourhoodSearch,
-    PathEntries,
-    Success,
-)
-from engram.localiser.tried import Tried
+from engram.localiser.relocalisation import Hypotheses, Relocaliser
+from engram.localiser.settings import LocaliserConfig, NeighbourhoodSearch, PathEntries, Success
+from engram.localiser.tracking import Prover, Track
 from engram.localiser.yardstick import Likeness, Run, Yardstick, is_measured
-from engram.odometry import UNMOVED, Motion, OdometryStatus
+from engram.odometry.motion import UNMOVED, Motion
+from engram.odometry.step import OdometryStatus
 from engram.processes import cores
-from engram.ranking import (
-    Foreseen,
-    RankingContext,
-    RankingPolicy,
-)
+from engram.ranking.context import Background, Foreseen, RankingContext, RankingPolicy
+
+# For a drive without an id: equal input still gives equal results.
+UNNAMED_LIVE_SESSION = SessionId(uuid5(ENGRAM_NAMESPACE, "live"))
+
+
+@dataclass(frozen=True, slots=True)
+class MapParts:
+    """What a localiser reads of a map; graph and paths may grow.
+
+    Attributes:
+        graph: the experience graph.
+        paths: the path memory.
+        frames: where the landmarks of nodes come from.
+        background: what policies may use of the map beyond its graph and paths.
+        search: stands for the graph's own `neighbourhood`, such as one with a cache that the
+            localisers of one drive on a fixed graph share; None for that itself. It is not asked
+            where the settings want another search.
+    """
+
+    graph: ExperienceGraph
+    paths: PathMemory
+    frames: LandmarkSource
+    background: Background = field(default_factory=Background)
+    search: Callable[..., Neighbourhood] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class InForce:
+    """By what a localiser localises.
+
+    Attributes:
+        policy: name of the ranking policy.
+        budget: attempts per frame.
+        config: its settings; neighbourhood, path entries and memory as its parts have them.
+    """
+
+    policy: str
+    budget: Budget
+    config: LocaliserConfig
+
+
+@dataclass(frozen=True, slots=True)
+class LiveDrive:
+    """The drive whose frames are localised.
+
+    Attributes:
+        basin: the match basin of its camera.
+        live: its session; the UUID seeds the matcher, so that the same drive gives the same
+            results.
+        saves: whether it is being mapped: then its own recent nodes are not candidates.
+        clock: time zone and location of its stamps; None if unknown.
+    """
+
+    basin: MatchBasin
+    live: SessionId = UNNAMED_LIVE_SESSION
+    saves: bool = False
+    clock: Clocked | None = None
+
 
 _PREFETCH = 16
 # Nodes near each weak match of a lost robot to try first: they would confirm it.

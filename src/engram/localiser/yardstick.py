@@ -24,7 +24,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram.config import check_bounds
-from engram.frontend import BRIEF, DescriptorKind, Frame
+from engram.frontend.frame import BRIEF, DescriptorKind, Frame
 from engram.frontend.matching import Match, MatcherConfig, match_frames, pair_seed
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, NodeId

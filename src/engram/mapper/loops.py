@@ -20,23 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import ConfigError
-from engram.frontend import Frame
+from engram.frontend.frame import Frame
 from engram.frontend.matching import Match
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind, Node, NodeId
 from engram.graph.neighbourhood import Search
-from engram.localiser import (
-    AcceptanceConfig,
-    Position,
-    Prediction,
-    agrees,
-    best_places,
-    spread,
-)
+from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
 from engram.localiser.attempts import Attempter, Candidate
+from engram.localiser.localisation import Position
+from engram.localiser.relocalisation import best_places, spread
 from engram.localiser.yardstick import Likeness, Yardstick, is_measured
-from engram.places.book import PlaceBook
+from engram.places.words import PlaceBook
 
 # Most likely places, from which those to attempt are chosen apart from each other.
 _SHORTLIST = 256

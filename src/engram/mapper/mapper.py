@@ -1,34 +1,504 @@
-"""The mapper: localise, else save an experience (method §5, [L15] §III, [1])."""
+"""Mapping: frames of a drive become nodes and edges of a map (method §5).
+
+Edges that live fixes contradict again and again: distrusted at once, removed with the session. Two
+nodes that one live frame matches surely are measured relative to each other. Where the map says
+otherwise, one of the edges between them joins what does not belong together. Each such frame votes
+against the edges of that chain which matching made; frames that agree vote for theirs. Odometry's
+own steps are not accused.
+"""
 
 from __future__ import annotations
 
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from queue import Full, Queue
+from threading import Thread
+from typing import Annotated, Protocol, TypeAlias
 
 import numpy as np
+from msgspec import Meta
 
-from engram.errors import ConfigError
-from engram.frontend import Frame, FrameStatus
-from engram.graph.graph import ExperienceGraph
+from engram.config import check_bounds
+from engram.errors import ConfigError, MapError
+from engram.frontend.frame import Frame, FrameStatus
+from engram.graph.graph import ChainTree, ExperienceGraph
 from engram.graph.model import (
+    Attempt,
     Edge,
     EdgeKind,
     Node,
     NodeId,
+    PathEntry,
     PathEntryKind,
+    PathId,
+    Removal,
     Session,
     node_id,
     path_id,
 )
 from engram.graph.proximity import ProximityConfig, lay_proximity_edges, tighten_chain
-from engram.localiser import Hint, Localisation, LocalisationStatus, Localiser, Position
-from engram.mapper.edges import edge_through_live, fits, match_edges
+from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
+from engram.localiser.attempts import Outcome
+from engram.localiser.localisation import Hint, Keeper, Localisation, LocalisationStatus, Position
+from engram.localiser.localiser import Localiser
+from engram.localiser.tracking import MOST_ON_TRIAL
 from engram.mapper.loops import LoopSearch
-from engram.mapper.memory import Memory, match_of
-from engram.mapper.saver import Records, Saver
-from engram.mapper.votes import EdgeVotes, VoteConfig
-from engram.maps import StoredSession
-from engram.odometry import Motion
+from engram.maps.frame_reader import FrameReader
+from engram.maps.records import StoredSession
+from engram.maps.writer import RevisionWriter
+from engram.odometry.motion import Motion
+from engram.places.words import NodeWords
+
+# Most frames that wait to be written, about 40 MB; beyond it a slow disk slows the drive.
+_QUEUE_LENGTH = 1000
+
+
+class PathWriter(Protocol):
+    """Where a session's path and attempts go: a map, or a spool."""
+
+    def add_path_entry(self, entry: PathEntry) -> None:
+        """Adds a step of the session's path."""
+        ...
+
+    def add_attempts(self, made: list[Attempt]) -> None:
+        """Adds remembered attempts."""
+        ...
+
+    def checkpoint(self) -> None:
+        """Makes everything added so far durable."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Records:
+    """What one live frame adds to the map."""
+
+    node: Node | None = None
+    frame: Frame | None = None
+    edges: Sequence[Edge] = ()
+    path_entries: Sequence[PathEntry] = ()
+    attempts: list[Attempt] = field(default_factory=list)
+
+    def __bool__(self) -> bool:
+        return bool(self.node or self.edges or self.path_entries or self.attempts)
+
+
+@dataclass(slots=True)
+class _Stop:
+    """The last thing in the queue."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSaver:
+    """Saves nodes and edges.
+
+    Attributes:
+        writer: writes them.
+        frames: keeps frames readable until they are written.
+        words: finds the words stored with saved nodes; None stores none.
+    """
+
+    writer: RevisionWriter
+    frames: FrameReader
+    words: NodeWords | None = None
+
+    def hold(self, records: Records) -> None:
+        """Keeps the frame of a node readable from now on."""
+        if records.node is not None and records.frame is not None:
+            self.frames.hold(records.node.id, records.frame)
+
+    def write(self, records: Records) -> None:
+        """Writes a node with its frame and words, and edges."""
+        if records.node is not None and records.frame is not None:
+            self.writer.add_node(records.node, records.frame)
+            if self.words is not None:
+                found = self.words.of_frame(records.frame)
+                self.writer.add_words(records.node.id, self.words.hash, found)
+        for edge in records.edges:
+            self.writer.add_edge(edge)
+
+
+@dataclass(slots=True)
+class Saver:
+    """Writes records in order, and checkpoints at intervals.
+
+    The next call of `put` or `finish` raises an error of the writer. Later records are dropped: a
+    shorter session is better than one with holes.
+
+    Attributes:
+        writer: where path entries and attempts go.
+        nodes: where nodes and edges go; None for a memory, which has none.
+        checkpoint_every: live frames between two checkpoints; a crash loses at most these.
+        waits: whether a full queue blocks the caller; else it raises.
+    """
+
+    writer: PathWriter
+    nodes: NodeSaver | None = None
+    checkpoint_every: int = 20
+    waits: bool = True
+    _queue: Queue[Records | _Stop] = field(default_factory=lambda: Queue(_QUEUE_LENGTH))
+    _error: BaseException | None = None
+    _thread: Thread | None = None
+
+    def __post_init__(self) -> None:
+        self._thread = Thread(target=self._run, name="engram-saver", daemon=True)
+        self._thread.start()
+
+    def put(self, records: Records) -> None:
+        """Queues what one frame adds to the map.
+
+        The frame of a node is readable from then on, even if it is never written.
+
+        Raises:
+            MapError: an earlier write failed, or too many wait to be written.
+        """
+        self.hold(records)
+        self._raise_error()
+        try:
+            self._queue.put(records, block=self.waits)
+        except Full:
+            raise MapError(
+                f"{_QUEUE_LENGTH} frames wait to be saved: the disk is too slow for this drive"
+            ) from None
+
+    def hold(self, records: Records) -> None:
+        """Keeps the frame of a node readable until it is put and written."""
+        if self.nodes is not None:
+            self.nodes.hold(records)
+
+    def finish(self) -> None:
+        """Writes the rest, checkpoints and ends the thread.
+
+        Raises:
+            MapError: a write failed.
+        """
+        if self._thread is not None:
+            self._queue.put(_Stop())
+            self._thread.join()
+            self._thread = None
+        self._raise_error()
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def _run(self) -> None:
+        since_checkpoint = 0
+        while True:
+            records = self._queue.get()
+            stopping = isinstance(records, _Stop)
+            if self._error is None:
+                try:
+                    if isinstance(records, Records):
+                        self._write(records)
+                        since_checkpoint += 1
+                    if stopping or since_checkpoint >= self.checkpoint_every:
+                        self.writer.checkpoint()
+                        since_checkpoint = 0
+                except BaseException as error:  # raised again in the caller's thread
+                    self._error = error
+            if stopping:
+                return
+
+    def _write(self, records: Records) -> None:
+        if self.nodes is not None:
+            self.nodes.write(records)
+        for entry in records.path_entries:
+            self.writer.add_path_entry(entry)
+        if records.attempts:
+            self.writer.add_attempts(records.attempts)
+
+
+# Uncertainty of a resumed robot's pose in the node it last matched: the match basin is wide.
+_RESUMED_SIGMA_M = 3.0
+_RESUMED_SIGMA_RAD = float(np.deg2rad(20.0))
+
+
+@dataclass(slots=True)
+class _Held:
+    """What a frame adds, while the fixes that it rests on may be withdrawn.
+
+    Attributes:
+        stamp_ns: of the frame.
+        records: without path entries.
+        visit: the node that it adds to the path, and how; None if none.
+    """
+
+    stamp_ns: int
+    records: Records
+    visit: tuple[NodeId, PathEntryKind] | None
+
+
+class Walk:
+    """Collects the entries of one session's path: one for each change of node (method §3.3)."""
+
+    def __init__(self, path: PathId, first_sequence: int = 0, node: NodeId | None = None) -> None:
+        self.path = path
+        self._sequence = first_sequence
+        self._node = node
+        self._new: list[PathEntry] = []
+
+    def visit(self, node: NodeId, kind: PathEntryKind, stamp_ns: int) -> None:
+        """Adds an entry if the node differs from the last one."""
+        if node == self._node:
+            return
+        self._new.append(PathEntry(self.path, self._sequence, node, kind, stamp_ns))
+        self._node = node
+        self._sequence += 1
+
+    def take_new(self) -> list[PathEntry]:
+        """The entries added since the last call."""
+        taken, self._new = self._new, []
+        return taken
+
+
+class Memory(Keeper):
+    """Remembers a drive without saving a node: its path and its attempts.
+
+    The policies `path` and `recall` use them in later drives. What fixes on trial add is held back:
+    those that are withdrawn leave no trace. Frames that an interrupted run had
+    remembered are only followed; the memory continues after them.
+
+    Args:
+        localiser: the drive's localiser.
+        saver: writes path and attempts.
+        path: the drive's path.
+        stored: what an interrupted run had stored of the drive; None for a new one.
+    """
+
+    def __init__(
+        self, localiser: Localiser, saver: Saver, path: PathId, stored: StoredSession | None = None
+    ) -> None:
+        self._localiser = localiser
+        self._saver = saver
+        self._stored = stored
+        self._held: deque[_Held] = deque()
+        self.walk = Walk(path)
+        if stored is not None and stored.last_entry is not None:
+            self.walk = Walk(path, stored.next_sequence, stored.last_entry.node)
+            localiser.resume(0.0, stored.next_iteration)
+
+    def hint(self, live: Frame, motion: Motion) -> Hint | None:
+        """See `Keeper`: frames of an interrupted run are not localised again."""
+        if not self._is_stored(live.stamp_ns):
+            return None
+        assert self._stored is not None
+        entry, position = self._stored.last_entry, None
+        if entry and entry.stamp_ns == live.stamp_ns and entry.kind is PathEntryKind.MATCHED:
+            spread = np.diag([_RESUMED_SIGMA_M**2] * 3 + [_RESUMED_SIGMA_RAD**2] * 3)
+            position = self._localiser.standing_at(entry.node, live, spread)
+        followed = Localisation(
+            live.stamp_ns, LocalisationStatus.DEAD_RECKONING, 0, 0, 0.0, motion, resumed=True
+        )
+        return Hint(position, guessed_m=np.inf, found=followed)
+
+    def keep(self, live: Frame, found: Localisation) -> Localisation:
+        """See `Keeper`."""
+        if not found.resumed:
+            self._put(live, Records(), match_of(found))
+        return found
+
+    def withdrawn(self, found: Localisation) -> None:
+        """See `Keeper`: the frame was not localised, and its attempts failed."""
+        for one in self._held:
+            if one.stamp_ns == found.stamp_ns:
+                failed = [replace(attempt, accepted=False) for attempt in one.records.attempts]
+                one.records, one.visit = replace(one.records, attempts=failed), None
+
+    def finish(self) -> None:
+        """See `Keeper`: what is still held back is kept."""
+        self._release()
+
+    def _is_stored(self, stamp_ns: int) -> bool:
+        """Whether an interrupted run processed the frame."""
+        last_ns = None if self._stored is None else self._stored.last_stamp_ns
+        return last_ns is not None and stamp_ns <= last_ns
+
+    def _put(
+        self, live: Frame, records: Records, visit: tuple[NodeId, PathEntryKind] | None
+    ) -> None:
+        """Adds the frame's attempts and its visit, and hands all to the saver once it is sure."""
+        records = replace(records, attempts=self._localiser.attempts())
+        self._held.append(_Held(live.stamp_ns, records, visit))
+        waiting = MOST_ON_TRIAL if self._localiser.on_trial else 0
+        if waiting:
+            self._saver.hold(records)
+        self._release(waiting)
+
+    def _release(self, waiting: int = 0) -> None:
+        """Hands frames to the saver, but for so many of the newest."""
+        while len(self._held) > waiting:
+            one = self._held.popleft()
+            if one.visit is not None:
+                self.walk.visit(*one.visit, one.stamp_ns)
+            records = replace(one.records, path_entries=self.walk.take_new())
+            if records:
+                self._saver.put(records)
+
+
+def match_of(found: Localisation) -> tuple[NodeId, PathEntryKind] | None:
+    """The visit of a localised frame; None for another."""
+    return None if found.node is None else (found.node, PathEntryKind.MATCHED)
+
+
+def match_edges(
+    graph: ExperienceGraph, outcomes: Sequence[Outcome], config: AcceptanceConfig
+) -> list[Edge]:
+    """Edges between nodes that one live frame matched: their relative pose is measured.
+
+    A measurement that contradicts the known path between two nodes gives no edge: one of the two
+    matches is then wrong, and its edge would fold the map permanently. This happens when a lost
+    robot tries nodes far apart.
+
+    Args:
+        graph: has all nodes of the outcomes.
+        outcomes: of one live frame. All edges start at the node of the best match.
+        config: allowed disagreement with the known path, as for a match.
+
+    Returns:
+        Edges of kind `MATCH`, the best match's node as `a`.
+    """
+    best_first = sorted(outcomes, key=lambda outcome: -outcome.match.inliers)
+    seen_from = [
+        Position(outcome.candidate.node, pose, covariance)
+        for outcome in best_first
+        if outcome.accepted
+        and (pose := outcome.match.reference_from_live) is not None
+        and (covariance := outcome.match.covariance) is not None
+    ]
+    edges = [edge_through_live(seen_from[0], other, EdgeKind.MATCH) for other in seen_from[1:]]
+    return [edge for edge in edges if fits(graph, edge, config)]
+
+
+def edge_through_live(a: Position, b: Position, kind: EdgeKind) -> Edge:
+    """The edge from `a.node` to `b.node`, of which each sees the same live camera."""
+    a_from_b = a.node_from_live @ b.node_from_live.inverse()
+    adjoint = a_from_b.adjoint()
+    covariance = a.covariance + adjoint @ b.covariance @ adjoint.T
+    return Edge(a.node, b.node, kind, a_from_b, covariance)
+
+
+def fits(graph: ExperienceGraph, edge: Edge, config: AcceptanceConfig) -> bool:
+    """Whether an edge agrees with the known path between its ends; True without a path."""
+    known = graph.predict(graph.index(edge.a), graph.index(edge.b))
+    if known is None:
+        return True
+    a_from_b, covariance = known
+    whole = covariance + edge.covariance
+    sigma_m, sigma_rad = (
+        float(np.sqrt(max(np.linalg.eigvalsh(part)[-1], 0.0)))
+        for part in (whole[:3, :3], whole[3:, 3:])
+    )
+    return agrees(edge.a_from_b, Prediction(a_from_b, sigma_m, sigma_rad), config)
+
+
+# Of a distrusted edge: nothing is predicted through it any more.
+_NOWHERE = np.diag([1e3**2] * 3 + [np.pi**2] * 3)
+
+
+@dataclass(frozen=True, slots=True)
+class VoteConfig:
+    """Settings of `EdgeVotes`.
+
+    Raises:
+        ConfigError: a value is out of its bounds.
+    """
+
+    against: Annotated[
+        int,
+        Meta(ge=1, description="frames that contradict an edge before it is distrusted, plus "
+             "twice the frames that agree with it"),
+    ] = 4  # fmt: skip
+    inliers: Annotated[
+        int,
+        Meta(ge=0, description="fewest inliers of both matches of a vote; look-alikes reach 50"),
+    ] = 60
+    gross_m: Annotated[
+        float, Meta(ge=0, description="least disagreement that is a contradiction, m")
+    ] = 2.0
+    sigmas: Annotated[
+        float, Meta(ge=0, description="the same in standard deviations of the chain")
+    ] = 4.0
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+
+
+class EdgeVotes:
+    """Votes of the frames of one drive.
+
+    Args:
+        graph: the experience graph of the drive alone: distrusted edges are changed in it.
+        config: settings.
+
+    Attributes:
+        removals: the distrusted edges, to be stored with the drive.
+    """
+
+    def __init__(self, graph: ExperienceGraph, config: VoteConfig | None = None) -> None:
+        self.config = config or VoteConfig()
+        self.removals: list[Removal] = []
+        self._graph = graph
+        self._against: Counter[int] = Counter()
+        self._agreeing: Counter[int] = Counter()
+
+    def count(self, stamp_ns: int, outcomes: Sequence[Outcome]) -> None:
+        """Counts the votes of one localised frame, and distrusts what was contradicted too often.
+
+        Args:
+            stamp_ns: stamp of the frame.
+            outcomes: of its attempts.
+        """
+        sure = sorted(self._sure(outcomes), key=lambda found: found[0], reverse=True)
+        if len(sure) < 2:
+            return
+        best = sure[0][1]
+        measured = [edge_through_live(best, other, EdgeKind.MATCH) for _, other in sure[1:]]
+        goals = [self._graph.index(edge.b) for edge in measured]
+        tree = self._graph.chains_from(self._graph.index(best.node), goals=goals)
+        against, agreeing = set[int](), set[int]()
+        for edge, goal in zip(measured, goals, strict=True):
+            if goal in tree.row_of and edge.a != edge.b:
+                chain = set(self._chain(tree, goal))
+                (against if self._contradicts(edge, tree, goal) else agreeing).update(chain)
+        self._agreeing.update(agreeing)
+        self._against.update(against - agreeing)
+        for row in sorted(against - agreeing):
+            most = max(self.config.against, 2 * self._agreeing[row])
+            if self._against[row] >= most:
+                self._distrust(row, stamp_ns)
+
+    def _sure(self, outcomes: Sequence[Outcome]) -> Iterator[tuple[int, Position]]:
+        for one in outcomes:
+            pose, covariance = one.match.reference_from_live, one.match.covariance
+            if pose is None or covariance is None or one.match.inliers < self.config.inliers:
+                continue
+            yield one.match.inliers, Position(one.candidate.node, pose, covariance)
+
+    def _contradicts(self, edge: Edge, tree: ChainTree, goal: int) -> bool:
+        pose = tree.pose(goal)
+        covariance = tree.error(goal).pivoted(pose.translation).covariance() + edge.covariance
+        sigma_m = float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0)))
+        off_m = float(np.linalg.norm(pose.translation - edge.a_from_b.translation))
+        return off_m > max(self.config.gross_m, self.config.sigmas * sigma_m)
+
+    def _chain(self, tree: ChainTree, goal: int) -> Iterator[int]:
+        """Edges that matching made, on the path from the tree's root to a node."""
+        row = tree.row_of[goal]
+        while (half := int(tree.half_edges[row])) >= 0:
+            if self._graph.edges[half // 2].kind is not EdgeKind.ODOMETRY:
+                yield half // 2
+            row = int(tree.parents[row])
+
+    def _distrust(self, row: int, stamp_ns: int) -> None:
+        edge, count = self._graph.edges[row], self._against.pop(row)
+        self._graph.add_edge(replace(edge, covariance=_NOWHERE))
+        reason = f"{count} frames of a drive that matched nodes on both sides contradict it"
+        self.removals.append(
+            Removal(edge.a, edge.b, edge.kind, edge.a_from_b, reason, removed_ns=stamp_ns)
+        )
+
 
 EdgeKey: TypeAlias = tuple[NodeId, NodeId, EdgeKind]
 

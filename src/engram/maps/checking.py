@@ -12,7 +12,6 @@ import numpy as np
 from sqlalchemy import Table, select
 
 from engram.errors import EngramError, MapCorruptError
-from engram.frontend import DescriptorKind, FrameStatus, feature_kind
 from engram.frontend.blobs import (
     HASH_BYTES,
     blob_hash,
@@ -20,16 +19,18 @@ from engram.frontend.blobs import (
     decode_landmarks,
     decode_thumbnail,
 )
-from engram.geometry import StereoCamera
+from engram.frontend.features import feature_kind
+from engram.frontend.frame import DescriptorKind, FrameStatus
+from engram.geometry.cameras import StereoCamera
 from engram.graph.model import NodeId, PathEntryKind, SessionId
-from engram.maps.attempts import unpack
-from engram.maps.keys import LARGEST_KEY
+from engram.maps.attempts import decode_words, unpack
 from engram.maps.marks import goal_from_row, removal_from_row
 from engram.maps.records import CheckReport, Problem
 from engram.maps.rows import (
     Row,
     amendment_from_row,
     camera_from_row,
+    check_tally,
     describe,
     edges_from_rows,
     from_json,
@@ -67,8 +68,7 @@ from engram.maps.schema import (
     words,
 )
 from engram.maps.sqlite import SqliteDatabase
-from engram.maps.tally import check_tally
-from engram.maps.words import decode_words
+from engram.maps.view import LARGEST_KEY
 
 # The table that a column refers to.
 _REFERENCES = {

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Table, select
 
 from engram.errors import MapCorruptError
-from engram.graph.attempts import Attempts
+from engram.graph.paths import Attempts
 from engram.maps.attempts import COLUMNS, unpack
 from engram.maps.reading import load_cameras, load_frontends
 from engram.maps.rows import Row, verified, verified_values

@@ -13,10 +13,9 @@ from typing import Any, TypeAlias
 from sqlalchemy import Select, Table, insert, select
 
 from engram.files import new_file
-from engram.maps.rows import verified
+from engram.maps.rows import count_tags, verified
 from engram.maps.schema import KEYED, VERSIONED, cameras, frontends, nodes, revisions, tags, words
 from engram.maps.sqlite import SqliteDatabase
-from engram.maps.tally import count_tags
 from engram.maps.view import View, head
 
 # In the order in which rows refer to each other.

@@ -13,16 +13,15 @@ from numpy.typing import NDArray
 from sqlalchemy import bindparam, select
 
 from engram.errors import InputError, MapCorruptError, MapError
-from engram.frontend import DescriptorKind, Frame, FrameStatus
 from engram.frontend.blobs import blob_hash, decode_landmarks, decode_thumbnail, is_intact
-from engram.geometry import StereoCamera
+from engram.frontend.frame import DescriptorKind, Frame, FrameStatus
+from engram.geometry.cameras import StereoCamera
 from engram.graph.model import Node, NodeId
-from engram.maps.database import reading_rows
 from engram.maps.reading import load_cameras, load_frontends
 from engram.maps.records import StoredNode
 from engram.maps.rows import Row, verified
 from engram.maps.schema import frames, nodes
-from engram.maps.sqlite import SqliteDatabase
+from engram.maps.sqlite import SqliteDatabase, reading_rows
 from engram.maps.view import View
 
 DEFAULT_CACHE_BYTES = 256 * 2**20

@@ -14,7 +14,6 @@ from sqlalchemy import Connection, Table, func, insert, select
 
 from engram.errors import InputError, RevisionError
 from engram.graph.model import Node, Session
-from engram.maps.keys import KeyBook
 from engram.maps.reading import load
 from engram.maps.records import MapContents, Revision
 from engram.maps.rows import Row, sealed, session_row, verified
@@ -32,7 +31,7 @@ from engram.maps.schema import (
     revisions,
     sessions,
 )
-from engram.maps.view import View
+from engram.maps.view import KeyBook, View
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,7 +14,7 @@ from engram.graph.clock import hour_of_day, zone_note
 from engram.graph.model import Clock, Session
 from engram.maps.difference import MapDifference, difference, hours_of_nodes
 from engram.maps.hiding import Reverted
-from engram.maps.opening import open_map
+from engram.maps.map import open_map
 from engram.maps.records import MapContents, Revision
 from engram.maps.tags import Tag
 

@@ -15,29 +15,54 @@ from sqlalchemy import insert
 
 from engram.errors import InputError, RevisionError
 from engram.files import map_path
-from engram.geometry import StereoCamera
-from engram.graph.model import Amendable, NodeId, SessionId
+from engram.geometry.cameras import StereoCamera
+from engram.graph.clock import check_zone
+from engram.graph.model import LONGEST_NAME, Amendable, Amendment, NodeId, Session, SessionId
 from engram.keywords import keywords
-from engram.maps.amending import checked_amendments
+from engram.maps.attempts import words_row, write_words
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES
 from engram.maps.hiding import Reverted, compare, hide_revision
 from engram.maps.map_writer import MapWriter
 from engram.maps.records import Revision, RevisionStatus
-from engram.maps.revisions import (
-    collect_abandoned,
-    commit_revision,
-    new_revision,
-)
-from engram.maps.rows import sealed
+from engram.maps.revisions import collect_abandoned, commit_revision, new_revision
+from engram.maps.rows import START, checked_text, sealed
 from engram.maps.schema import revisions
 from engram.maps.sqlite import SqliteDatabase
 from engram.maps.tags import Tag, TagWriter
 from engram.maps.view import View
-from engram.maps.words import words_row, write_words
 
 if TYPE_CHECKING:
     from engram.robot.robot import Robot
     from engram.robot.settings import Settings
+
+
+def checked_amendments(
+    shown: Session, changes: Mapping[Amendable, str], now_ns: int
+) -> dict[Amendable, Amendment]:
+    """The amendments that change a session.
+
+    Raises:
+        InputError: none does, or a value is not valid.
+        ConfigError: the zone is unknown.
+    """
+    found = {}
+    for what, value in changes.items():
+        checked_text(value, what)
+        if what is Amendable.ZONE:
+            check_zone(value)
+        if (
+            not value
+            or (what is Amendable.ROBOT and len(value) > LONGEST_NAME)
+            or (what is Amendable.START and not START.fullmatch(value))
+        ):
+            raise InputError(f"{value!r:.60} is not valid as the {what} of a session")
+        amendment = Amendment(shown.id, what, value, now_ns)
+        if amendment.applied(shown) != shown:
+            found[what] = amendment
+    if not found:
+        raise InputError(f"session {shown.id} has these values already: nothing to amend")
+    return found
+
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -331,3 +356,29 @@ class Map(MapWriter):
 
 class _DryRunError(Exception):
     """Ends a transaction without committing it."""
+
+
+@keywords()
+def open_map(path: Path | str, at: int | str | None = None, create: bool = False) -> Map:
+    """Opens a map for localising, writing or reading.
+
+    Until it is written to, the map stays as it is now, whatever others commit: open it again to see
+    later revisions. A robot stays with the map that it began in.
+
+    Args:
+        path: NAME.engram.
+        at: number or name of a revision (7, a tag, "head~2"), to see the map as it was then; None
+            for the newest.
+        create: create an empty map if the file does not exist and no revision is named.
+
+    Raises:
+        NotAMapError: the file does not exist, or is not a map.
+        FormatVersionError: a newer Engram wrote it.
+        MapCorruptError: it is too damaged to read.
+        RevisionError: there is no such revision.
+        InputError: a map is to be created, and its folder does not exist.
+        ConfigError: a keyword is unknown.
+    """
+    if create and at is None and not map_path(path).exists():
+        Map.create(path).close()
+    return Map.open(path, at=at)

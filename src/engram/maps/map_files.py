@@ -1,17 +1,110 @@
-"""Operations on whole map files: open, copy, rewrite, verify."""
+"""The files of a map: copies, and damage in a write-ahead log.
+
+Damage in a write-ahead log, which SQLite takes for the log's end without a word. Frames of a log
+chain their checksums. SQLite reads up to the first that does not fit, so a damaged frame loses what
+was committed after it. A log that ends early is an earlier state of its map, and a writer that is
+killed may leave one unfinished frame; both are sound.
+
+Source: SQLite, "WAL-mode File Format".
+"""
 
 from __future__ import annotations
 
+import itertools
+import os
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import BinaryIO
 
-from engram.errors import MapCorruptError
+import numpy as np
+
+from engram.errors import InputError, MapCorruptError
 from engram.files import current_holder, map_path
 from engram.maps.checking import check
 from engram.maps.records import CheckReport, Problem
 from engram.maps.sqlite import SqliteDatabase
-from engram.maps.write_ahead import log_problems
+from engram.untrusted import open_regular
+
+_HEADER, _FRAME_HEAD = 32, 24
+# Byte order of the words of checksums, by the log's first bytes.
+_ORDERS = {b"\x37\x7f\x06\x82": "<u4", b"\x37\x7f\x06\x83": ">u4"}
+_SALTS = slice(16, 24)
+_SUMMED = 24  # bytes of the header that its checksum covers
+_MASK = 0xFFFFFFFF
+# Logs begun since a frame that was written over, at most; each raises the first salt by one.
+_GENERATIONS = 2**20
+
+
+def log_problems(path: Path) -> list[str]:
+    """Faults of the log of a database without a writer; empty if there is no log.
+
+    Args:
+        path: the database. Neither it nor its log is opened by SQLite yet, which would fold the
+            log into the file up to its first damaged frame.
+
+    Raises:
+        InputError: the log cannot be read.
+    """
+    log = path.with_name(f"{path.name}-wal")
+    if not log.exists():
+        return []
+    with os.fdopen(open_regular(log, InputError), "rb") as file:
+        fact = _problem(file)
+    return [] if fact is None else [f"{log.name}: {fact}; what was written after it is lost"]
+
+
+def _problem(file: BinaryIO) -> str | None:
+    header = file.read(_HEADER)
+    if len(header) < _HEADER:
+        return None  # empty, or its writer was killed before the first frame
+    page = int.from_bytes(header[8:12], "big")
+    order = _ORDERS.get(header[:4])
+    if order is None or not 512 <= page <= 65_536 or page & (page - 1):
+        return "its header is damaged"
+    summed = _sum(header[:_SUMMED], (0, 0), order)
+    if summed != _stored(header, _SUMMED):
+        return "its header does not match its checksum"
+    for number in itertools.count(1):
+        head, content = file.read(_FRAME_HEAD), file.read(page)
+        if len(content) < page:
+            return None
+        if head[8:16] != header[_SALTS]:
+            older = _is_older(head, header) and not _goes_on(file, header, page)
+            return None if older else f"frame {number} is of another log"
+        summed = _sum(content, _sum(head[:8], summed, order), order)
+        if summed != _stored(head, 16):
+            return f"frame {number} does not match its checksum"
+    raise AssertionError
+
+
+def _is_older(head: bytes, header: bytes) -> bool:
+    """Whether a frame was left by a log that this one was written over."""
+    ours, its = (int.from_bytes(one, "big") for one in (header[16:20], head[8:12]))
+    return 1 <= (ours - its) & _MASK <= _GENERATIONS
+
+
+def _goes_on(file: BinaryIO, header: bytes, page: int) -> bool:
+    """Whether a frame of this log comes after one that is not."""
+    while len(head := file.read(_FRAME_HEAD)) == _FRAME_HEAD:
+        if head[8:16] == header[_SALTS]:
+            return True
+        file.seek(page, os.SEEK_CUR)
+    return False
+
+
+def _stored(body: bytes, at: int) -> tuple[int, int]:
+    return int.from_bytes(body[at : at + 4], "big"), int.from_bytes(body[at + 4 : at + 8], "big")
+
+
+def _sum(body: bytes, before: tuple[int, int], order: str) -> tuple[int, int]:
+    """SQLite's checksum of an even number of words: s0 += x0 + s1, s1 += x1 + s0."""
+    s0, s1 = before
+    words = np.frombuffer(body, order).tolist()
+    for even, odd in zip(words[::2], words[1::2], strict=True):
+        s0 = (s0 + even + s1) & _MASK
+        s1 = (s1 + odd + s0) & _MASK
+    return s0, s1
 
 
 def copy_map(source: Path, target: Path) -> None:

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.counts import counted
 from engram.errors import InputError
-from engram.geometry import SE3
-from engram.graph.adjusting import Poses
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
-from engram.graph.marks import Goal, Placement
-from engram.graph.model import NodeId
+from engram.graph.model import Edge, Goal, Node, NodeId, Placement
 from engram.graph.placing import DEFAULT_CONFIG as PLACING
+from engram.graph.placing import PlacingConfig, Poses, place, replace_after_removal
+
+if TYPE_CHECKING:
+    from engram.maps.map_reader import MapReader
+
 
 # Metres per degree of latitude, and the least movement that is worth a word.
 _DEGREE_M = 111_320.0
@@ -294,3 +297,49 @@ def _apart_m(one: SE3, other: SE3) -> float:
 def _about_vertical(yaw_rad: float) -> NDArray[np.float64]:
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+# Name of the statistic that holds latitude and longitude of the frame's origin.
+ORIGIN = "map_frame"
+
+
+def frame_of(store: MapReader, revision: int, nodes: int) -> MapFrame:
+    """The map frame of an opened map; `MapReader.frame` shares it.
+
+    Args:
+        store: the map.
+        revision, nodes: of the map, for `MapReader.derived`: the frame changes with them.
+    """
+    del revision, nodes
+    graph = store.graph
+    origin = store.statistics().get(ORIGIN)
+    known = None if not origin else (origin["latitude_deg"], origin["longitude_deg"])
+    return MapFrame(graph, place(graph, store.placements), known)
+
+
+def new_places(
+    store: MapReader, contents: Mapping[str, float], config: PlacingConfig
+) -> list[Placement]:
+    """The places that an open revision has to write, around those that nodes have.
+
+    Args:
+        store: the map, which sees the rows of the revision.
+        contents: number of rows that the revision wrote, by table.
+        config: how new nodes are laid out.
+    """
+    graph = store.grown_graph() if not contents["removals"] else None
+    if graph is None:
+        found = store.load()
+        graph = graph_of(found.nodes, found.edges)
+    own = contents["placements"] or contents["hidden"]
+    before = store.read_placements() if own else store.placements
+    lay_out = replace_after_removal if contents["removals"] else place
+    return changed(before, graph, lay_out(graph, before, config), config.same_m)
+
+
+def graph_of(nodes: Sequence[Node], edges: Sequence[Edge]) -> ExperienceGraph:
+    """A graph of these records."""
+    graph = ExperienceGraph()
+    graph.add_nodes(nodes)
+    graph.add_edges(edges)
+    return graph

@@ -2,43 +2,44 @@
 
 from __future__ import annotations
 
+import gc
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, select
 
 from engram.errors import InputError
-from engram.frontend import DescriptorKind
-from engram.geometry import SE3, CameraId, StereoCamera
-from engram.graph.attempts import Attempts
+from engram.frontend.frame import DescriptorKind
+from engram.geometry.cameras import CameraId, StereoCamera
+from engram.geometry.se3 import SE3
 from engram.graph.basin import BasinCounts
 from engram.graph.graph import ExperienceGraph
-from engram.graph.marks import Anchor, Goal, Removal
 from engram.graph.model import (
     Amendment,
+    Anchor,
     EdgeKind,
+    Goal,
     NodeId,
     Omission,
     PathId,
+    Removal,
     Session,
     SessionId,
 )
-from engram.graph.paths import PathMemory
+from engram.graph.paths import Attempts, PathMemory
 from engram.maps import marks, reading
+from engram.maps.attempts import load_words
 from engram.maps.checking import check
-from engram.maps.collector import no_collections
 from engram.maps.content import content_hash, record_hashes
-from engram.maps.database import reading_rows
 from engram.maps.difference import STRETCH_M, MapDifference, difference
 from engram.maps.frame_reader import FrameReader
-from engram.maps.laying_out import frame_of, graph_of
-from engram.maps.map_frame import MapFrame
-from engram.maps.provenance import Origin, origin_of
+from engram.maps.map_frame import MapFrame, frame_of, graph_of
 from engram.maps.records import (
     CheckReport,
     InterruptedSession,
@@ -47,19 +48,27 @@ from engram.maps.records import (
     Revision,
     SessionState,
 )
-from engram.maps.revisions import (
-    interrupted_sessions,
-    session_and_revision,
-)
+from engram.maps.revisions import interrupted_sessions, session_and_revision
 from engram.maps.rows import Row, verified
 from engram.maps.schema import revisions
-from engram.maps.sqlite import SqliteDatabase
-from engram.maps.tags import Tag, load_tags, resolve
+from engram.maps.sqlite import SqliteDatabase, reading_rows
+from engram.maps.tags import Origin, Tag, load_tags, origin_of, resolve
 from engram.maps.view import View
-from engram.maps.words import load_words
 
-if TYPE_CHECKING:
-    pass
+
+@contextmanager
+def no_collections() -> Iterator[None]:
+    """Pauses the garbage collector: records hold no cycles, and each pass would visit all of them.
+
+    A process whose collector is off already keeps it off.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 _P = ParamSpec("_P")

@@ -10,15 +10,14 @@ from sqlalchemy import Connection, insert
 
 from engram.errors import IncompatibleError, RevisionError
 from engram.files import Holder, WriterLock
-from engram.frontend import DescriptorKind
-from engram.geometry import SE3, StereoCamera
-from engram.graph.marks import Placement
-from engram.graph.model import NodeId, Session, SessionId
+from engram.frontend.frame import DescriptorKind
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+from engram.graph.model import NodeId, Placement, Session, SessionId
 from engram.graph.placing import PlacingConfig
 from engram.maps import reading
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES
-from engram.maps.keys import KeyBook
-from engram.maps.laying_out import new_places
+from engram.maps.map_frame import new_places
 from engram.maps.map_reader import MapReader
 from engram.maps.records import Revision, SessionState
 from engram.maps.revisions import (
@@ -31,7 +30,7 @@ from engram.maps.revisions import (
 from engram.maps.rows import Row, sealed, session_from_row
 from engram.maps.schema import revisions
 from engram.maps.sqlite import SqliteDatabase
-from engram.maps.view import View, head
+from engram.maps.view import KeyBook, View, head
 from engram.maps.writer import Resumable, RevisionWriter
 
 

@@ -9,9 +9,17 @@ import numpy as np
 from sqlalchemy import Connection, Table, select
 
 from engram.errors import InputError, MapCorruptError
-from engram.geometry import SE3
-from engram.graph.marks import Anchor, Goal, Mark, Placement, Removal, same_measurement
-from engram.graph.model import EdgeKind, NodeId
+from engram.geometry.se3 import SE3
+from engram.graph.model import (
+    Anchor,
+    EdgeKind,
+    Goal,
+    Mark,
+    NodeId,
+    Placement,
+    Removal,
+    same_measurement,
+)
 from engram.maps.columns import read_columns
 from engram.maps.rows import (
     Row,

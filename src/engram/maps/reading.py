@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Select, func, select, union
 
 from engram.errors import MapCorruptError
-from engram.frontend import DescriptorKind, feature_kind
 from engram.frontend.blobs import content_digest
-from engram.geometry import CameraId, StereoCamera
-from engram.graph.attempts import Attempts
-from engram.graph.edge_table import EDGE_KINDS, EdgeTable
+from engram.frontend.features import feature_kind
+from engram.frontend.frame import DescriptorKind
+from engram.geometry.cameras import CameraId, StereoCamera
+from engram.graph.graph import EDGE_KINDS, EdgeTable
 from engram.graph.model import (
     Amendment,
     EdgeKind,
@@ -28,6 +28,7 @@ from engram.graph.model import (
     Session,
     SessionId,
 )
+from engram.graph.paths import Attempts
 from engram.maps.attempts import unpack
 from engram.maps.columns import Columns, read_columns
 from engram.maps.marks import counting, edge_key, is_removed, removed_measurements

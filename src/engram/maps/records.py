@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import DescriptorKind, FrameStatus
-from engram.geometry import CameraId, StereoCamera
-from engram.graph.attempts import Attempts
+from engram.frontend.frame import DescriptorKind, FrameStatus
+from engram.geometry.cameras import CameraId, StereoCamera
 from engram.graph.basin import BasinCounts, count_attempts
 from engram.graph.model import Edge, Node, PathEntry, Session, SessionId
+from engram.graph.paths import Attempts
 
 
 class RevisionStatus(StrEnum):

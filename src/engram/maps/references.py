@@ -8,17 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import IncompatibleError, InputError
-from engram.frontend import DescriptorKind
-from engram.geometry import StereoCamera
+from engram.frontend.frame import DescriptorKind
+from engram.geometry.cameras import StereoCamera
 from engram.graph.model import NodeId
 from engram.maps import reading
-from engram.maps.keys import KeyBook
 from engram.maps.records import StoredNode
 from engram.maps.row_buffer import RowBuffer
 from engram.maps.rows import camera_row
 from engram.maps.schema import cameras, frontends, path_entries, paths, sessions
 from engram.maps.sqlite import SqliteDatabase
-from engram.maps.view import View
+from engram.maps.view import KeyBook, View
 
 
 class References:

@@ -13,7 +13,6 @@ from engram.errors import MapCorruptError, RevisionError
 from engram.files import Holder
 from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, SessionId, path_id
 from engram.maps import reading
-from engram.maps.keys import KeyBook
 from engram.maps.records import InterruptedSession, Revision, RevisionStatus, StoredSession
 from engram.maps.rows import (
     Row,
@@ -39,7 +38,7 @@ from engram.maps.schema import (
     sessions,
     words,
 )
-from engram.maps.view import View, head, place_in_history
+from engram.maps.view import KeyBook, View, head, place_in_history
 
 _ABANDONED = select(revisions.c.key).where(revisions.c.status == str(RevisionStatus.ABANDONED))
 

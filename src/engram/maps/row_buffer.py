@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, Table, delete, insert, select
 
-from engram.graph.attempts import Attempts
 from engram.graph.model import Edge
-from engram.maps.attempts import pack, unpack
-from engram.maps.database import upsert
-from engram.maps.keys import KeyBook
+from engram.graph.paths import Attempts
+from engram.maps.attempts import pack, unpack, words_row, write_words
 from engram.maps.rows import Row, edge_row, sealed, verified
 from engram.maps.schema import (
     amendments,
@@ -36,7 +34,8 @@ from engram.maps.schema import (
     statistics,
     vocabularies,
 )
-from engram.maps.words import words_row, write_words
+from engram.maps.sqlite import upsert
+from engram.maps.view import KeyBook
 
 # Bytes of a row as Python objects, without its blobs.
 _ROW_BYTES = 600

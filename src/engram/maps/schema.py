@@ -241,7 +241,7 @@ tags = _table(
     _int("tagged_ns"),
 )
 
-# One row: what the rows of tags come to, which no revision counts (`engram.maps.tally`).
+# One row: what the rows of tags come to, which no revision counts (`engram.maps.rows`).
 tag_tally = _table(
     "tag_tally",
     _key(),

@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from sqlalchemy import Table
 
 from engram.errors import IncompatibleError, InputError, RevisionError
-from engram.frontend import DescriptorKind, Frame
 from engram.frontend.blobs import blob_hash, content_digest, encode_landmarks, encode_thumbnail
-from engram.geometry import StereoCamera
-from engram.graph.attempts import Attempts
-from engram.graph.marks import Mark
+from engram.frontend.frame import DescriptorKind, Frame
+from engram.geometry.cameras import StereoCamera
 from engram.graph.model import (
     Amendment,
     Attempt,
     Edge,
+    Mark,
     Node,
     NodeId,
     Omission,
@@ -30,12 +29,12 @@ from engram.graph.model import (
     SessionId,
     path_id,
 )
+from engram.graph.paths import Attempts
 from engram.graph.placing import DEFAULT_CONFIG as PLACING
 from engram.graph.placing import PlacingConfig
 from engram.maps import reading
 from engram.maps.frame_reader import FrameReader
 from engram.maps.hiding import check_same_node, check_same_session, hidden_row, hidden_rows
-from engram.maps.keys import KeyBook
 from engram.maps.marks import mark_row
 from engram.maps.records import Revision, RevisionStatus, StoredNode, StoredSession
 from engram.maps.references import References
@@ -47,13 +46,7 @@ from engram.maps.revisions import (
     revision_contents,
 )
 from engram.maps.row_buffer import RowBuffer
-from engram.maps.rows import (
-    check_edge,
-    checked_int,
-    session_row,
-    to_json,
-    transform_bytes,
-)
+from engram.maps.rows import check_edge, checked_int, session_row, to_json, transform_bytes
 from engram.maps.schema import (
     amendments,
     cameras,
@@ -71,7 +64,7 @@ from engram.maps.schema import (
     vocabularies,
 )
 from engram.maps.sqlite import SqliteDatabase
-from engram.maps.view import View
+from engram.maps.view import KeyBook, View
 
 # Most bytes in memory of a revision that is not resumable.
 _BATCH_BYTES = 8 * 2**20

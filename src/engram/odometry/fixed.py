@@ -25,10 +25,11 @@ from numpy.typing import NDArray
 
 from engram import _core
 from engram.config import check_bounds
-from engram.frontend import Frame, FrameStatus, Landmarks, MatcherConfig
-from engram.frontend.matching import features, match_frames
-from engram.geometry import SE3, StereoCamera
-from engram.odometry.guess import Guess
+from engram.frontend.frame import Frame, FrameStatus, Landmarks
+from engram.frontend.matching import MatcherConfig, features, match_frames
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+from engram.odometry.step import Guess
 
 _NOTHING = np.zeros(0, np.bool_)
 # Most frames over which landmarks are compared.

@@ -14,19 +14,12 @@ from numpy.typing import NDArray
 
 from engram.errors import ConfigError
 from engram.graph.model import Clock, NodeId, SessionId
-from engram.localiser import Localisation, LocalisationStatus
-from engram.maps import Map, open_map
-from engram.ranking import (
-    Foreseen,
-    RankingContext,
-    RankingPolicy,
-    Reasons,
-    check_for_robot,
-    policy_named,
-    reasons_of,
-)
+from engram.localiser.localisation import Localisation, LocalisationStatus
+from engram.maps.map import Map, open_map
+from engram.ranking.context import Foreseen, RankingContext, RankingPolicy, Reasons, reasons_of
+from engram.ranking.policies import check_for_robot, policy_named
 from engram.robot.front import arriving
-from engram.robot.session import DriveSequence
+from engram.robot.localisers import DriveSequence
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_on
 

@@ -14,26 +14,23 @@ from typing import TypeAlias, TypeVar
 
 import numpy as np
 
-from engram.doctor import Diagnosis, Examination, diagnose
+from engram.doctor.examination import Examination
+from engram.doctor.table import Diagnosis, diagnose
 from engram.errors import IncompatibleError, InputError
-from engram.frontend import Frame, FrameStatus, Frontend, StereoPair, check_pair
-from engram.geometry import SE3, StereoCamera
+from engram.frontend.frame import Frame, FrameStatus, StereoPair
+from engram.frontend.frontend import Frontend, check_pair
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
-from engram.localiser import Position, StageClock
-from engram.odometry import (
-    FixedPixels,
-    GapFiller,
-    Motion,
-    Odometry,
-    OdometryStatus,
-    OdometryStep,
-    OutsideModel,
-    OutsideMotion,
-)
-from engram.odometry.frozen import Repeats, StandsStill, rests
+from engram.localiser.localisation import Position, StageClock
+from engram.odometry.fixed import FixedPixels
+from engram.odometry.motion import GapFiller, Motion
+from engram.odometry.odometry import Odometry
+from engram.odometry.outside import OutsideModel, OutsideMotion, Repeats, StandsStill, rests
+from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.robot.settings import Settings
-from engram.sequences import LoggedFrame
 from engram.sequences.clocks import SteadyClock
+from engram.sequences.sequence import LoggedFrame
 
 T = TypeVar("T")
 Arrived: TypeAlias = StereoPair | LoggedFrame

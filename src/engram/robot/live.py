@@ -1,35 +1,463 @@
-"""Saving during a live drive: map or memory grow in parallel, without delaying the robot."""
+"""Saving a drive: in a map or next to it, live without delaying the robot's loop.
+
+A drive's memory in a file next to the map, until the map's writer is free. A robot that only
+remembers needs the map's writer at the end of its drive, not throughout: others may map meanwhile.
+So its path and attempts go to a separate file, which also survives a crash. The next process that
+finds the writer free commits them as a session.
+
+The file is a sequence of chunks: length and CRC-32 of the body, each a little-endian uint32, then
+the body, compressed MessagePack. The first chunk is the header. A chunk torn by a crash ends the
+file.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+import fcntl
+import glob
+import os
+import platform
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from dataclasses import asdict, astuple, dataclass, replace
+from enum import StrEnum
 from itertools import count
 from pathlib import Path
-from typing import Protocol
+from typing import IO, Any, Protocol
+from uuid import UUID
 
-from engram.doctor import Finding
-from engram.errors import MapError, MapLockedError
-from engram.frontend import DescriptorKind, Frontend, StereoPair
-from engram.geometry import StereoCamera
-from engram.graph.model import Clock, Session, SessionId, path_id
-from engram.localiser import (
-    KEEPS_NOTHING,
-    UNNAMED_LIVE_SESSION,
-    Keeper,
-    Localiser,
-    Relocaliser,
+import msgspec
+
+from engram import __version__
+from engram.config import to_dict
+from engram.doctor.table import Finding
+from engram.errors import MapCorruptError, MapError, MapLockedError, storage_full
+from engram.frontend.frame import DescriptorKind, StereoPair
+from engram.frontend.frontend import Frontend
+from engram.geometry.cameras import StereoCamera
+from engram.graph.model import (
+    Attempt,
+    Clock,
+    NodeId,
+    PathEntry,
+    PathEntryKind,
+    Session,
+    SessionId,
+    path_id,
 )
-from engram.mapper import Memory, Saver
-from engram.maps import Map
+from engram.localiser.acceptance import Rule
+from engram.localiser.attempts import Attempter, FrameMatcher
+from engram.localiser.localisation import KEEPS_NOTHING, Keeper
+from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser
+from engram.localiser.relocalisation import ByAppearance, Relocaliser, Suggested
+from engram.localiser.yardstick import Yardstick
+from engram.mapper.loops import LoopConfig, LoopSearch
+from engram.mapper.mapper import Mapper, Memory, NodeSaver, Saver
+from engram.maps.map import Map, open_map
+from engram.maps.records import Revision, SessionState, StoredSession
+from engram.maps.rows import camera_from_row, camera_row
+from engram.maps.writer import RevisionWriter
+from engram.places.recognisers import RECOGNISERS
+from engram.places.words import NodeWords, words_of
 from engram.robot.front import Arrived
-from engram.robot.localisers import localiser_in
-from engram.robot.saved import Saving, SavingState
-from engram.robot.saving import SavedDrive, configuration_of, node_words
+from engram.robot.localisers import drives_of, localiser_in
 from engram.robot.settings import RobotOptions, Settings
-from engram.robot.spool import Spool, commit_spools
-from engram.sequences import SequenceInfo, first_pair_hash, session_of
+from engram.sequences.sequence import SequenceInfo, first_pair_hash, session_of
+
+
+class SavingState(StrEnum):
+    """State of the saving of a live drive."""
+
+    OFF = "off"
+    ON = "on"
+    FAILED = "failed"
+    SPOOLED = "spooled"
+    COMMITTED = "committed"
+    UNCOMMITTED = "uncommitted"
+
+
+@dataclass(slots=True)
+class Saving:
+    """Whether and where a live drive is saved.
+
+    Attributes:
+        state: `FAILED` after a write error: the robot continues to localise, and what it had saved
+            is kept; `SPOOLED` if another process writes to the map, so that the drive's memory
+            waits in a file next to it; `UNCOMMITTED` if the doctor found something fatal: a mapped
+            session then waits for ``engram check --seal``.
+        reason: why saving failed or was not committed, or where the memory waits.
+        session: the drive.
+        revision: number of the revision that holds the drive.
+        nodes: number of saved nodes.
+        recovered: revisions that hold what earlier drives of the robot had saved when their process
+            was killed.
+    """
+
+    state: SavingState = SavingState.OFF
+    reason: str = ""
+    session: SessionId | None = None
+    revision: int | None = None
+    nodes: int = 0
+    recovered: tuple[int, ...] = ()
+
+    def text(self) -> str:
+        """For people."""
+        earlier = ", ".join(map(str, self.recovered))
+        said = f"; what was saved before an interruption: revision {earlier}" if earlier else ""
+        return self._state_text() + said
+
+    def _state_text(self) -> str:
+        match self.state:
+            case SavingState.COMMITTED if self.revision is None:
+                return "the map already remembers this drive, or there was nothing to remember"
+            case SavingState.COMMITTED:
+                return f"kept as revision {self.revision}"
+            case SavingState.SPOOLED:
+                return (
+                    f"another process writes to the map: the drive waits in {self.reason}; the "
+                    "next run that maps or remembers commits it"
+                )
+            case SavingState.FAILED:
+                return f"saving failed: {self.reason}"
+            case SavingState.UNCOMMITTED:
+                kept = "; engram check --seal commits what was mapped anyway" if self.nodes else ""
+                return f"not committed, because the drive is unfit: {self.reason}{kept}"
+        return f"saving is {self.state}"
+
+
+class SavedDrive:
+    """Saves one drive with a mapper, on its own thread, and commits it.
+
+    Args:
+        opened: the map, open for writing; its graph grows.
+        writer: writer of the session.
+        localiser: localiser of the drive, in the same map.
+        settings: settings of the mapper and the map frame.
+        words: finds the words of nodes, see `node_words`.
+        waits: whether a slow disk slows the drive; else it ends the saving.
+
+    Attributes:
+        mapper: the drive's keeper.
+    """
+
+    def __init__(
+        self,
+        opened: Map,
+        writer: RevisionWriter,
+        localiser: Localiser,
+        settings: Settings,
+        words: NodeWords | None,
+        *,
+        waits: bool = True,
+    ) -> None:
+        opened.derived(drives_of)[writer.session.id] = writer.session
+        self._writer, self._placing = writer, settings.placing
+        every = settings.mapper.checkpoint_every
+        self._saver = Saver(writer, NodeSaver(writer, opened.frames, words), every, waits)
+        self._stack = ExitStack()
+        loops = self._stack.enter_context(loop_search(opened, localiser, settings))
+        self.mapper = Mapper(
+            localiser.graph,
+            localiser,
+            self._saver,
+            writer.session,
+            settings.mapper,
+            loops,
+            writer.stored,
+        )
+
+    def finish(self) -> None:
+        """Ends the drive and saves what its last frames still add."""
+        self.mapper.finish()
+
+    def close(self) -> None:
+        """Writes what is queued, and ends the threads. The session can be resumed.
+
+        Raises:
+            MapError: a write failed.
+        """
+        with self._stack:
+            self._saver.finish()
+
+    def commit(self) -> Revision:
+        """Makes the session a revision of the map, without the edges that its fixes disproved."""
+        for removal in self.mapper.votes.removals:
+            self._writer.add_mark(removal)
+        return self._writer.commit(self._placing)
+
+    def leave(self) -> None:
+        """Leaves the session uncommitted, for ``engram check --seal`` alone."""
+        self._writer.leave()
+
+
+def commit_crashed(opened: Map, robot: str, settings: Settings) -> tuple[int, ...]:
+    """Commits what earlier live drives of a robot had saved before their process ended.
+
+    Drives that `engram map` was mapping stay as they are: it resumes them. So do those that the
+    doctor found unfit.
+
+    Args:
+        opened: the map; sees the new revisions.
+        robot: name of the robot.
+        settings: how the map frame is laid out.
+
+    Returns:
+        Numbers of the revisions.
+
+    Raises:
+        MapLockedError: another process writes to the map.
+        MapError: it cannot be written.
+    """
+    waiting = [one for one in opened.interrupted() if one.live and one.pid]
+    mine = [one.session.id for one in waiting if one.session.robot == robot]
+    if not mine:
+        return ()
+    numbers = []
+    with Map.open(opened.location, writes=True) as own:
+        for session in mine:
+            writer = own.resume_session(session)
+            if writer.stored == StoredSession():
+                writer.abandon()  # it ended before it had saved anything
+            else:
+                numbers.append(writer.commit(settings.placing).number)
+    with opened.writing():
+        pass  # shows it the newest revision
+    return tuple(numbers)
+
+
+def configuration_of(settings: Settings, options: RobotOptions) -> dict[str, Any]:
+    """The resolved configuration, which every revision keeps."""
+    return {
+        "settings": to_dict(settings),
+        "options": to_dict(options),
+        "machine": platform.machine(),
+        "engram": __version__,
+    }
+
+
+def node_words(opened: Map, settings: Settings, relocaliser: str | None) -> NodeWords | None:
+    """Finds the words of saved nodes; first adds those missing from older nodes."""
+    if relocaliser not in RECOGNISERS:
+        return None
+    words = opened.derived(words_of, settings.frontend.descriptor)
+    words.keep_missing([node.id for node in opened.graph.nodes])
+    return words
+
+
+def loop_search(
+    opened: Map, localiser: Localiser, settings: Settings
+) -> LoopSearch | nullcontext[None]:
+    """Loop search by the words of the relocaliser; a null context if it has none."""
+    finder = localiser.relocaliser
+    if isinstance(finder, Suggested):
+        finder = finder.inner
+    if not isinstance(finder, ByAppearance):
+        return nullcontext()
+    matching = settings.localiser
+    attempter = Attempter(opened.frames, matching, FrameMatcher(opened.frames, matching.matcher))
+    told = matching.lookalikes.doubt > 0 and matching.acceptance.rule is Rule.CONFIDENCE
+    return LoopSearch(
+        localiser.graph,
+        finder.book,
+        attempter,
+        matching.acceptance,
+        LoopConfig(near_m=matching.search_radius_m, own_exclusion_m=matching.own_exclusion_m),
+        Yardstick(localiser.graph, attempter.frame, matching.matcher) if told else None,
+    )
+
+
+_CHUNK = struct.Struct("<II")
+_VERSION = 1
+
+
+class Spool:
+    """Writes one drive's memory; a `PathWriter` of a session without nodes.
+
+    Args:
+        map_path: the map; the file lies next to it.
+        session: the drive.
+        camera: its camera.
+        made_by: kind of its descriptors, and hash of the front-end.
+        configuration: kept with the revision.
+        most_bytes: largest size; later records are dropped.
+
+    Raises:
+        MapError: the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        map_path: Path,
+        session: Session,
+        camera: StereoCamera,
+        made_by: tuple[DescriptorKind, str],
+        configuration: dict[str, Any],
+        most_bytes: int,
+    ) -> None:
+        self.path = map_path.with_name(f"{map_path.name}-memory-{session.id}")
+        self._most_bytes = most_bytes
+        self._entries: list[PathEntry] = []
+        self._attempts: list[Attempt] = []
+        with _as_map_errors(self.path):
+            self._file: IO[bytes] = _opened(self.path, os.O_CREAT | os.O_RDWR | os.O_TRUNC)
+        self._append(
+            {
+                "version": _VERSION,
+                "session": asdict(session),
+                "camera": camera_row(camera, 0),
+                "descriptor": made_by[0],
+                "frontend": made_by[1],
+                "configuration": configuration,
+            }
+        )
+
+    @property
+    def full(self) -> bool:
+        """Whether it has reached its largest size and drops further records."""
+        return self._file.tell() >= self._most_bytes
+
+    def add_path_entry(self, entry: PathEntry) -> None:
+        """See `PathWriter`."""
+        self._entries.append(entry)
+
+    def add_attempts(self, made: list[Attempt]) -> None:
+        """See `PathWriter`."""
+        self._attempts += made
+
+    def checkpoint(self) -> None:
+        """See `PathWriter`."""
+        if (self._entries or self._attempts) and not self.full:
+            entries, attempts = ([astuple(x) for x in y] for y in (self._entries, self._attempts))
+            self._append({"entries": entries, "attempts": attempts})
+        self._entries, self._attempts = [], []
+
+    def close(self) -> None:
+        """Closes the file; from now on it may be committed."""
+        self._file.close()
+
+    def _append(self, content: dict[str, Any]) -> None:
+        body = zlib.compress(msgspec.msgpack.encode(content))
+        with _as_map_errors(self.path):
+            self._file.write(_CHUNK.pack(len(body), zlib.crc32(body)) + body)
+            self._file.flush()
+            os.fsync(self._file.fileno())
+
+
+def commit_spools(map_path: Path) -> dict[Path, Revision]:
+    """Commits the memories next to a map, each as a session without nodes; returns the revisions.
+
+    Memories of running drives are left alone. Entries and attempts of nodes that the map no longer
+    shows are left out.
+
+    Raises:
+        MapLockedError: another process writes to the map; the memories wait.
+        MapError: the map cannot be written, or a memory cannot be read.
+    """
+    spools = sorted(map_path.parent.glob(f"{glob.escape(map_path.name)}-memory-*"))
+    if not spools:
+        return {}
+    committed = {}
+    with open_map(map_path) as opened, opened.writing():
+        for path in spools:
+            with suppress(BlockingIOError, FileNotFoundError), _opened(path, os.O_RDONLY) as file:
+                revision = _commit(opened, _chunks(file, path), path)
+                path.unlink()
+                if revision is not None:
+                    committed[path] = revision
+    return committed
+
+
+def _commit(opened: Map, chunks: Iterator[dict[str, Any]], path: Path) -> Revision | None:
+    """The revision; None if the memory is empty or already in the map."""
+    header = next(chunks, None)
+    if header is None:
+        return None  # killed before the header was written
+    if header["version"] != _VERSION:
+        raise MapError(f"{path} was written by a newer Engram; upgrade to commit it")
+    graph, session = opened.graph, _session(header["session"])
+    entries, attempts = list[PathEntry](), list[Attempt]()
+    for chunk in chunks:
+        found = (_entry(session, row) for row in chunk["entries"])
+        entries += [one for one in found if one.node in graph]
+        made = (_attempt(row) for row in chunk["attempts"])
+        attempts += [one for one in made if one.reference in graph and one.node in graph]
+    state = opened.session_state(session.id)
+    if state is SessionState.COMMITTED or not (entries or attempts):
+        return None
+    if state is SessionState.INTERRUPTED:
+        writer = opened.resume_session(session.id)
+    else:
+        writer = opened.begin_session(
+            session,
+            camera_from_row(header["camera"]),
+            descriptor=DescriptorKind(header["descriptor"]),
+            frontend=header["frontend"],
+            author=session.robot,
+            configuration=header["configuration"],
+            message=f"memory of {session.robot}",
+        )
+    for entry in entries:
+        if entry.sequence >= writer.stored.next_sequence:
+            writer.add_path_entry(entry)
+    first = writer.stored.next_iteration
+    writer.add_attempts([one for one in attempts if one.iteration >= first])
+    return writer.commit()
+
+
+def _entry(session: Session, row: list[Any]) -> PathEntry:
+    _, sequence, node, kind, stamp_ns = row
+    kind = PathEntryKind(kind)
+    return PathEntry(path_id(session.id), sequence, NodeId(UUID(node)), kind, stamp_ns)
+
+
+def _attempt(row: list[Any]) -> Attempt:
+    iteration, reference, node, *rest = row
+    return Attempt(iteration, NodeId(UUID(reference)), NodeId(UUID(node)), *rest)
+
+
+def _session(values: dict[str, Any]) -> Session:
+    fields = {**values, "id": SessionId(UUID(values["id"])), "clock": Clock(values["clock"])}
+    return Session(**fields)
+
+
+def _chunks(file: IO[bytes], path: Path) -> Iterator[dict[str, Any]]:
+    """The intact chunks of a memory."""
+    while len(head := file.read(_CHUNK.size)) == _CHUNK.size:
+        length, checksum = _CHUNK.unpack(head)
+        body = file.read(length)
+        if len(body) < length or zlib.crc32(body) != checksum:
+            return
+        try:
+            yield msgspec.msgpack.decode(zlib.decompress(body))
+        except (msgspec.DecodeError, zlib.error) as error:
+            raise MapCorruptError(f"{path} is not a memory of a drive: {error}") from error
+
+
+def _opened(path: Path, flags: int) -> IO[bytes]:
+    """A regular file, locked for this process.
+
+    Raises:
+        BlockingIOError: another process holds it.
+    """
+    file = os.fdopen(os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666),
+                     "rb" if flags == os.O_RDONLY else "r+b")  # fmt: skip
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise
+    return file
+
+
+@contextmanager
+def _as_map_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        full = storage_full(error, path)
+        raise full or MapError(f"{path} cannot be written: {error.strerror}") from error
+
 
 # Stamps from here (1973) on come from a clock; smaller ones count from the robot's start.
 _CLOCK_FROM_NS = 10**17
@@ -210,7 +638,7 @@ class IntoMap:
 
 
 class IntoMemory:
-    """Keeps only path and attempts of a drive; see `engram.robot.spool`.
+    """Keeps only path and attempts of a drive; see `engram.robot.live`.
 
     Args:
         owner: the robot.

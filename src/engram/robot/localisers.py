@@ -3,38 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypedDict, Unpack
+from typing import TypeAlias, TypedDict, Unpack
 
 import numpy as np
 
-from engram.errors import ConfigError
-from engram.frontend import DescriptorKind
-from engram.geometry import StereoCamera
+from engram.errors import ConfigError, InputError, SequenceError
+from engram.frontend.frame import DescriptorKind
+from engram.geometry.cameras import StereoCamera
 from engram.graph.basin import MatchBasin
 from engram.graph.clock import Clocked
 from engram.graph.model import Session, SessionId, path_id
 from engram.graph.neighbourhood import Neighbourhood
-from engram.localiser import (
-    RELOCALISERS,
-    UNNAMED_LIVE_SESSION,
-    Budget,
-    LiveDrive,
-    Localiser,
-    MapParts,
-    Matcher,
-    Relocaliser,
-)
+from engram.localiser.attempts import Matcher
+from engram.localiser.localisation import Budget
+from engram.localiser.localiser import UNNAMED_LIVE_SESSION, LiveDrive, Localiser, MapParts
+from engram.localiser.relocalisation import RELOCALISERS, Relocaliser
 from engram.localiser.settings import LocaliserConfig
-from engram.maps import Map
+from engram.maps.map import Map
 from engram.places.words import words_of
-from engram.ranking import (
-    Background,
-    Lessons,
-    RankingPolicy,
-    policy_named,
-    uses_words,
-)
+from engram.ranking.context import Background, Lessons, RankingPolicy, uses_words
+from engram.ranking.policies import policy_named
 from engram.robot.settings import Settings
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.sequence import StereoSequence, first_pair_hash, session_of
 
 
 class LocaliserParts(TypedDict, total=False):
@@ -138,3 +129,29 @@ def lessons_of(opened: Map, focal_px: float, config: LocaliserConfig) -> Lessons
     rates = basin.success_rate(along_m, across_m)
     viewers = [path_id(session) for session in opened.sessions]
     return Lessons.learnt(opened.graph, opened.path_memory, viewers, made, rates, config.lessons)
+
+
+DriveSequence: TypeAlias = StereoSequence | FrameLog
+
+
+def session_of_drive(sequence: DriveSequence) -> Session:
+    """The session of a drive: the same drive read twice is the same session (method §2.7).
+
+    Raises:
+        InputError: the argument is a path or a list, not an opened drive.
+        SequenceError: the drive has no usable frame.
+    """
+    if not isinstance(sequence, StereoSequence | FrameLog):
+        raise InputError(
+            f"a value of {type(sequence).__name__} is not a drive: open a path with "
+            "engram.open_drive(PATH); give pairs of your own to `step` of Map.robot(maps=True)"
+        )
+    info = sequence.info
+    if isinstance(sequence, FrameLog):
+        return session_of(
+            info, sequence.camera, int(sequence.stamps_ns[0]), sequence.first_pair_hash
+        )
+    first = next(iter(sequence), None)
+    if first is None:
+        raise SequenceError(f"{info.name}: no frame can be used")
+    return session_of(info, sequence.camera, first.stamp_ns, first_pair_hash(first))

@@ -1,33 +1,225 @@
-"""Mapping a whole drive: open or resume its session, feed the mapper, commit."""
+"""Mapping a whole drive, the doctor's part in it, and recording it as a frame log."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
-from engram.doctor import Diagnosis
-from engram.errors import ConfigError
+import numpy as np
+
+from engram.config import config_hash
+from engram.counts import counted
+from engram.doctor.examination import Facts
+from engram.doctor.table import Diagnosis
+from engram.errors import ConfigError, SequenceError, UnfitDriveError
 from engram.files import check_parent
-from engram.frontend import DescriptorKind, Frontend, feature_kind
+from engram.frontend.features import feature_kind
+from engram.frontend.frame import DescriptorKind, Frame, FrameStatus
+from engram.frontend.frontend import Frontend
+from engram.geometry.cameras import StereoCamera
 from engram.graph.model import Session
 from engram.keywords import keywords
-from engram.localiser import Localisation, Localiser
-from engram.maps import Map, RevisionWriter, SessionState, open_map
-from engram.monitor import QUIET, Monitor
-from engram.robot.examining import LookedAhead, facts_of, refuse_unfit
-from engram.robot.fixed import relocaliser_with_fixes
-from engram.robot.front import Front
-from engram.robot.localisers import localiser_in
-from engram.robot.results import summarise
+from engram.localiser.localisation import Localisation
+from engram.localiser.localiser import Localiser
+from engram.maps.map import Map, open_map
+from engram.maps.records import SessionState
+from engram.maps.writer import RevisionWriter
+from engram.monitor import QUIET, Monitor, deferred_interrupt, interruptible
+from engram.odometry.outside import MotionSource, OutsideMotion
+from engram.odometry.step import OdometryStatus
+from engram.robot.anchors import relocaliser_with_fixes
+from engram.robot.front import Arrived, Front, arriving, stamp_of
+from engram.robot.live import SavedDrive, commit_spools, configuration_of, node_words
+from engram.robot.localisers import DriveSequence, localiser_in, session_of_drive
 from engram.robot.robot import Robot
-from engram.robot.saving import SavedDrive, configuration_of, node_words
-from engram.robot.session import DriveSequence, session_of_drive
 from engram.robot.settings import RobotOptions, Settings
-from engram.robot.spool import commit_spools
-from engram.sequences import FrameLog, stamps_of
+from engram.robot.starting import summarise
+from engram.sequences.framelog.file import FrameLogHeader
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.layouts import ImageSequence
+from engram.sequences.motion import MovedSequence
+from engram.sequences.opening import Drive, stamps_of
+from engram.sequences.sequence import LoggedFrame, SequenceInfo, first_pair_hash
+
+# A long drive is examined in so many stretches, as it may begin at rest or in the dark.
+_STRETCHES = 4
+
+
+def facts_of(sequence: DriveSequence, *, by_hour: bool = False) -> Facts:
+    """Facts about a drive in addition to its frames."""
+    info = sequence.info
+    step = sequence.frames.step if isinstance(sequence, ImageSequence) else 1
+    bits = sequence.bits() if isinstance(sequence, ImageSequence) else None
+    return Facts(info.clock, info.zone, info.longitude_deg, by_hour, step, bits)
+
+
+def examine_drive(
+    sequence: Drive,
+    settings: Settings | None = None,
+    monitor: Monitor = QUIET,
+    *,
+    by_hour: bool = False,
+    seen: Callable[[int, Arrived], None] = lambda *_: None,
+) -> Diagnosis:
+    """Examines up to `DoctorConfig.frames` frames of a drive, in stretches spread over it.
+
+    Of a bag, which is a stream, the first ones.
+
+    Open the drive with `skip_bad`: then bad pairs and stamps out of order are findings, not errors.
+
+    Args:
+        sequence: the drive.
+        settings: the resolved configuration; None for the defaults.
+        monitor: receives each frame, and may stop the examination.
+        by_hour: whether missions by hour need the drive's clock.
+        seen: called with the number and the images of each frame that is examined.
+
+    Raises:
+        SequenceError: an image cannot be used.
+    """
+    front = Front(settings or Settings())
+    evidence = front.examination.evidence
+    evidence.facts = facts_of(sequence, by_hour=by_hour)
+    with interruptible(monitor) as watched:
+        chosen = _chosen(sequence, front, evidence.config.frames)
+        for number, (arrived, outside) in enumerate(chosen):
+            front.take(arrived, outside)
+            seen(number, arrived)
+            watched.advance("examined")
+            watched.check()
+    evidence.bad += sequence.skipped_reasons
+    evidence.read = stamps_of(sequence)
+    return front.diagnosis
+
+
+def _chosen(
+    sequence: Drive, front: Front, most: int
+) -> Iterator[tuple[Arrived, OutsideMotion | None]]:
+    """The frames that are examined; the front starts again with each stretch of them."""
+    source = sequence.motion()
+    runs: Iterable[Iterable[Arrived]] = [islice(sequence, most)]
+    if isinstance(sequence, ImageSequence):
+        runs = (sequence.usable(stretch) for stretch in stretches(len(sequence), most))
+    elif isinstance(sequence, FrameLog):
+        runs = (map(sequence.read, stretch) for stretch in stretches(len(sequence), most))
+    for run in runs:
+        front.restart()
+        last_ns: int | None = None
+        for arrived in run:
+            stamp_ns = stamp_of(arrived)
+            if source is None or last_ns is None:
+                yield arrived, None
+            else:
+                yield arrived, source.between(last_ns, stamp_ns)
+            last_ns = stamp_ns
+
+
+def stretches(length: int, most: int) -> list[range]:
+    """Up to `most` frames of a drive: all of them, or runs of successive ones spread over it."""
+    if length <= most:
+        return [range(length)]
+    each = max(most // _STRETCHES, 1)
+    starts = np.linspace(0, length - each, min(_STRETCHES, most)).round().astype(int)
+    return [range(int(start), int(start) + each) for start in starts]
+
+
+class LookedAhead:
+    """A drive whose first frames were taken ahead, so that the doctor saw them before the map.
+
+    Images of those frames are not kept: they come as logged frames, the others as they are. It can
+    be iterated over once.
+
+    Args:
+        front: takes the frames, and later those of the robot that drives on.
+        sequence: the drive.
+        monitor: may stop it.
+    """
+
+    def __init__(self, front: Front, sequence: DriveSequence, monitor: Monitor = QUIET) -> None:
+        self.sequence = sequence
+        self._begin()
+        self._look(front, monitor)
+        if front.fixed_share:  # what is fixed to the camera is left out from the first frame on
+            front.look_again()
+            self._rest.close()
+            self._begin()
+            self._look(front, monitor)
+
+    def _begin(self) -> None:
+        sequence = self.sequence
+        self._rest = arriving(sequence)
+        self._ahead: list[LoggedFrame] = []
+        self._outside = sequence.motion() if isinstance(sequence, MovedSequence) else None
+        # Stamp of the last frame that was taken ahead.
+        self._until_ns: int | None = None
+
+    def _look(self, front: Front, monitor: Monitor) -> None:
+        """Takes frames ahead until the doctor has seen enough."""
+        with deferred_interrupt() as raise_if_asked:
+            while not front.examination.full:
+                arrived = next(self._rest, None)
+                if arrived is None:
+                    break
+                self._take(front, arrived)
+                monitor.check()
+                raise_if_asked()
+
+    def _take(self, front: Front, arrived: Arrived) -> None:
+        """Takes one frame ahead, with the motion from outside that led to it."""
+        stamp_ns, outside = stamp_of(arrived), None
+        if self._outside is not None and self._until_ns is not None:
+            outside = self._outside.between(self._until_ns, stamp_ns)
+        self._ahead.append(front.take_ahead(arrived, outside))
+        self._until_ns = stamp_ns
+
+    def motion(self) -> MotionSource | None:
+        """The motion from outside that was not used ahead."""
+        return None if self._outside is None else self
+
+    def between(self, start_ns: int, end_ns: int) -> OutsideMotion | None:
+        """See `MotionSource`; None where the frames were taken ahead."""
+        if self._outside is None or (self._until_ns is not None and end_ns <= self._until_ns):
+            return None
+        return self._outside.between(start_ns, end_ns)
+
+    @property
+    def info(self) -> SequenceInfo:
+        """Facts about the drive as a whole."""
+        return self.sequence.info
+
+    @property
+    def camera(self) -> StereoCamera:
+        """The one camera of the drive."""
+        return self.sequence.camera
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    def __iter__(self) -> Iterator[Arrived]:
+        ahead, self._ahead = self._ahead, []
+        return chain(ahead, self._rest)
+
+    def close(self) -> None:
+        """Ends the thread that reads ahead."""
+        self._rest.close()
+
+
+def refuse_unfit(diagnosis: Diagnosis, name: str, options: RobotOptions) -> None:
+    """Refuses a drive with a fatal finding, unless it is forced.
+
+    Raises:
+        UnfitDriveError: what is wrong with it.
+    """
+    if diagnosis.fatal and not options.force:
+        findings = "\n".join(one.text() for one in diagnosis.fatal)
+        raise UnfitDriveError(
+            f"{name}: not mapped, nothing was written; --force maps it anyway\n{findings}"
+        )
 
 
 @dataclass(slots=True)
@@ -259,3 +451,124 @@ def _made_by(sequence: DriveSequence, settings: Settings) -> tuple[DescriptorKin
     if isinstance(sequence, FrameLog):
         return sequence.header.descriptor, sequence.header.frontend
     return settings.frontend.descriptor, Frontend(settings.frontend).hash
+
+
+@dataclass(slots=True)
+class ExtractReport:
+    """Result of recording a drive.
+
+    Attributes:
+        log: the file.
+        frames: frames recorded by this run.
+        already_recorded: frames that an earlier run had recorded.
+        unusable: unusable frames: dark, covered, too few landmarks.
+        without_motion: frames whose odometry failed.
+        skipped: pairs left out under `skip_bad`.
+        bytes: size of the file.
+        interrupted: whether the run was stopped; the same command continues it.
+        diagnosis: what the doctor found in the first frames; a log holds no images for it to see.
+    """
+
+    log: str
+    frames: int = 0
+    already_recorded: int = 0
+    unusable: int = 0
+    without_motion: int = 0
+    skipped: int = 0
+    bytes: int = 0
+    interrupted: bool = False
+    diagnosis: Diagnosis | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``record --json`` prints."""
+        findings = [] if self.diagnosis is None else self.diagnosis.to_dict()["findings"]
+        values = asdict(replace(self, diagnosis=None))
+        del values["diagnosis"]
+        return {**values, "findings": findings}
+
+    def text(self) -> str:
+        """For people."""
+        total = self.frames + self.already_recorded
+        line = (
+            f"{counted(total, 'frame')} in {self.log}, {self.bytes / max(total, 1) / 1e3:.1f} kB "
+            f"each; {self.unusable} unusable, {self.without_motion} without motion, "
+            f"{counted(self.skipped, 'pair')} skipped"
+        )
+        if self.interrupted:
+            line += "\ninterrupted: progress is saved; give the same command to continue"
+        return line
+
+
+def extract_log(
+    sequence: DriveSequence,
+    out: Path,
+    settings: Settings,
+    monitor: Monitor = QUIET,
+) -> ExtractReport:
+    """Runs a drive's images through front-end and odometry and records the result.
+
+    An interrupted log is continued: odometry depends on earlier frames, so all frames run again,
+    and recorded ones are not written twice. The result equals that of an uninterrupted run.
+
+    Args:
+        sequence: a drive of images.
+        out: NAME.framelog.
+        settings: settings of front-end and odometry.
+        monitor: receives the status of each frame, and may stop the recording.
+
+    Raises:
+        SequenceError: the drive is already a frame log, or its images cannot be used.
+        IncompatibleError: the file is the log of another drive or of other frames.
+        MapError: the log cannot be written; what was recorded is intact.
+    """
+    report = ExtractReport(str(out))
+    front = Front(settings)
+    writer: FrameLogWriter | None = None
+    try:
+        with closing(arriving(sequence)) as pairs, deferred_interrupt() as raise_if_asked:
+            for pair in pairs:
+                raise_if_asked()
+                if isinstance(pair, LoggedFrame):
+                    raise SequenceError(f"{sequence.info.name}: the drive is already a frame log")
+                frame, motion = front.take(pair)
+                step = motion.odometry
+                if writer is None:
+                    writer = FrameLogWriter(out, _header(sequence, frame, settings))
+                _count(report, frame.status, step.status)
+                pair_hash = first_pair_hash(pair)
+                if writer.holds(frame.stamp_ns, pair_hash):
+                    report.already_recorded += 1
+                    monitor.advance("recorded already")
+                else:
+                    writer.append(LoggedFrame(frame, step), pair_hash)
+                    report.frames += 1
+                    monitor.advance(step.status.value)
+                monitor.check()
+        if writer is None:
+            raise SequenceError(f"{sequence.info.name}: no frame can be read")
+        writer.close(complete=True)
+    except KeyboardInterrupt:
+        report.interrupted = True
+    finally:
+        if writer is not None:
+            writer.close()  # also after an error or an interruption: progress is kept
+    report.diagnosis = front.diagnosis
+    report.skipped = sequence.skipped
+    report.bytes = out.stat().st_size if out.exists() else 0
+    return report
+
+
+def _header(sequence: DriveSequence, frame: Frame, settings: Settings) -> FrameLogHeader:
+    return FrameLogHeader(
+        sequence.info,
+        sequence.camera,
+        frame.descriptor,
+        frame.frontend,
+        config_hash(settings.odometry),
+        "" if isinstance(sequence, FrameLog) else str(getattr(sequence, "frames", "")),
+    )
+
+
+def _count(report: ExtractReport, frame: FrameStatus, odometry: OdometryStatus) -> None:
+    report.unusable += frame is not FrameStatus.OK
+    report.without_motion += odometry not in {OdometryStatus.OK, OdometryStatus.FIRST}

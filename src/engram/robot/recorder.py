@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 from engram import __version__
 from engram.config import check_bounds, config_hash, plain, to_dict
 from engram.errors import EngramError, InputError
-from engram.frontend import Frame, StereoPair
+from engram.frontend.frame import Frame, StereoPair
 from engram.graph.model import Clock
-from engram.localiser import Localisation, LocalisationStatus
 from engram.localiser.attempts import Outcome
+from engram.localiser.localisation import Localisation, LocalisationStatus
 from engram.robot.front import Arrived
-from engram.sequences import FrameLogHeader, LoggedFrame, SequenceInfo, first_pair_hash
-from engram.sequences.framelog import FlightWriter
+from engram.sequences.framelog.file import FrameLogHeader
+from engram.sequences.framelog.writer import FlightWriter
+from engram.sequences.sequence import LoggedFrame, SequenceInfo, first_pair_hash
 
 # Frames that wait for the recorder's thread, 25 MB of images; beyond them it leaves frames out.
 _WAITING = 64

@@ -11,41 +11,37 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
-from engram.doctor import Diagnosis
-from engram.doctor.findings import Finding
+import numpy as np
+
+from engram.doctor.table import Diagnosis, Finding
 from engram.errors import ConfigError, InputError, MapError
-from engram.frontend import Frame
-from engram.geometry import SE3, propagate_covariance
+from engram.frontend.frame import Frame
+from engram.geometry.se3 import SE3, propagate_covariance
 from engram.graph.graph import ExperienceGraph
-from engram.localiser import (
+from engram.graph.model import NodeId
+from engram.graph.placing import MAP_FROM_CAMERA
+from engram.localiser.attempts import Outcome
+from engram.localiser.localisation import (
     KEEPS_NOTHING,
     Keeper,
     Localisation,
     LocalisationStatus,
-    Localiser,
     Position,
     StageClock,
 )
-from engram.localiser.attempts import Outcome
-from engram.localiser.given import InForce
+from engram.localiser.localiser import InForce, Localiser
+from engram.maps.map_frame import MapFrame
 from engram.monitor import QUIET, Monitor, deferred_interrupt
-from engram.odometry import Motion, OdometryStatus, OdometryStep, OutsideMotion
-from engram.robot.front import (
-    Arrived,
-    Front,
-    arriving,
-    at_time,
-    check_position,
-    paced,
-    stamp_of,
-)
-from engram.robot.live import LiveDrive
+from engram.odometry.motion import Motion
+from engram.odometry.outside import OutsideMotion
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.robot.front import Arrived, Front, arriving, at_time, check_position, paced, stamp_of
+from engram.robot.live import LiveDrive, Saving
 from engram.robot.recorder import Recorder
-from engram.robot.saved import Saving
-from engram.sequences import LoggedFrame
 from engram.sequences.clocks import Placed
 from engram.sequences.framelog.reader import compose
 from engram.sequences.motion import MovedSequence
+from engram.sequences.sequence import LoggedFrame
 
 # Frames whose positions `pose_at` remembers: ten seconds at 20 Hz.
 _REMEMBERED = 200
@@ -495,3 +491,67 @@ def _is_elsewhere(placed: Placed, motion: Motion) -> bool:
     """Whether stamps went back and images do not match: another drive, or a simulator's reset."""
     back = placed.step is not None and placed.step.by_ns < 0
     return back and motion.guessed_m > 0 and motion.odometry.status is not OdometryStatus.OK
+
+
+class Whereabouts:
+    """Follows a robot in the map frame, for display and messages.
+
+    Nodes get their place in the frame with the revision that commits them. Until then one that the
+    robot saved lies where the robot took itself to be; one that it saved while it was lost, where
+    the graph has it, once that joins it to the map. In an empty map the first frame lies at the
+    origin and looks along x, as the committed frame will have it.
+
+    Args:
+        frame: that of the map as it was when the drive began.
+        graph: what the robot localises in, with the nodes that it saved.
+    """
+
+    def __init__(self, frame: MapFrame, graph: ExperienceGraph) -> None:
+        self._frame, self._graph = frame, graph
+        self._saved: dict[NodeId, SE3] = {}
+        # A node with a place; and the one without for which the graph was asked, and its edges.
+        self._placed: NodeId | None = None
+        self._asked: tuple[NodeId, int] | None = None
+
+    def of(self, node: NodeId) -> SE3 | None:
+        """``map_from_node``; None for a node without a place."""
+        return self._saved.get(node) or self._frame.find(node)
+
+    def after(self, found: Localisation) -> SE3 | None:
+        """``map_from_live`` at the next frame of the drive; None where it is not known.
+
+        Args:
+            found: the result of each frame, one after another.
+        """
+        position = found.position
+        map_from_node = None if position is None else self._found(position.node)
+        here = None
+        if position is not None and map_from_node is not None:
+            here = map_from_node @ position.node_from_live
+        elif found.saved is not None and not self._saved and not len(self._frame.positions):
+            here = SE3(MAP_FROM_CAMERA.copy(), np.zeros(3))
+        if found.saved is not None and here is not None:
+            self._saved[found.saved] = here
+        return here
+
+    def _found(self, node: NodeId) -> SE3 | None:
+        """The place of a node, if need be along the graph from the last one that had a place."""
+        map_from_node = self.of(node)
+        if map_from_node is None:
+            map_from_node = self._along_graph(node)
+        if map_from_node is not None:
+            self._placed = node
+        return map_from_node
+
+    def _along_graph(self, node: NodeId) -> SE3 | None:
+        graph, placed = self._graph, self._placed
+        asked = node, len(graph.edges)
+        if placed is None or asked == self._asked or node not in graph or placed not in graph:
+            return None
+        self._asked = asked
+        map_from_placed = self.of(placed)
+        way = graph.predict(graph.index(placed), graph.index(node))
+        if way is None or map_from_placed is None:
+            return None
+        self._saved[node] = map_from_placed @ way[0]
+        return self._saved[node]

@@ -8,21 +8,20 @@ from pathlib import Path
 from typing import Self
 
 from engram.config import load_toml
-from engram.doctor.settings import DoctorConfig
+from engram.doctor.examination import DoctorConfig
 from engram.errors import ConfigError
-from engram.frontend import DescriptorKind, FrontendConfig
 from engram.frontend.features import fitted_matcher
+from engram.frontend.frame import DescriptorKind
+from engram.frontend.frontend import FrontendConfig
 from engram.graph.placing import PlacingConfig
-from engram.localiser import Budget, LocaliserConfig
-from engram.mapper import MapperConfig
-from engram.odometry import (
-    FixedConfig,
-    FrozenConfig,
-    GapConfig,
-    OdometryConfig,
-    OutsideConfig,
-)
-from engram.ranking import check_for_robot
+from engram.localiser.localisation import Budget
+from engram.localiser.settings import LocaliserConfig
+from engram.mapper.mapper import MapperConfig
+from engram.odometry.fixed import FixedConfig
+from engram.odometry.motion import GapConfig
+from engram.odometry.odometry import OdometryConfig
+from engram.odometry.outside import FrozenConfig, OutsideConfig
+from engram.ranking.policies import check_for_robot
 
 # Settings files that ship with the package: the rules of one paper each.
 PAPERS = ("linegar2015", "gadd2016")

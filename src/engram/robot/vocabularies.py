@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from engram.config import to_dict
 from engram.counts import counted
 from engram.errors import IncompatibleError, InputError, MapCorruptError
-from engram.frontend import BRIEF, DescriptorKind, Frame, FrameStatus, Frontend
+from engram.frontend.frame import BRIEF, DescriptorKind, Frame, FrameStatus
+from engram.frontend.frontend import Frontend
 from engram.graph.model import NodeId
-from engram.maps import Map
+from engram.maps.map import Map
 from engram.monitor import QUIET, Monitor
-from engram.places import (
+from engram.places.vocabulary import (
     TrainingConfig,
     Vocabulary,
     decode_vocabulary,
@@ -28,9 +29,10 @@ from engram.places import (
 )
 from engram.places.words import NodeWords, vocabulary_or_default
 from engram.robot.front import arriving
-from engram.robot.session import DriveSequence
+from engram.robot.localisers import DriveSequence
 from engram.robot.settings import Settings
-from engram.sequences import LoggedFrame, open_drive
+from engram.sequences.opening import open_drive
+from engram.sequences.sequence import LoggedFrame
 
 MAP_SUFFIX = ".engram"
 

@@ -3,7 +3,3 @@
 Monday's drive is in the sun. Tuesday's, by the same robot, is under clouds; it begins 7 m further
 on and ends 7 m further on. `python -m engram_lab.demo.sample_drives` renders them.
 """
-
-from engram.sample.drives import DRIVES, SampleDrive, offsets_m, write_drives
-
-__all__ = ["DRIVES", "SampleDrive", "offsets_m", "write_drives"]

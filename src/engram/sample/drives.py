@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from engram.errors import InputError, storage_full
 from engram.files import draft_folder, naming
+from engram.maps.map import open_map
 from engram.monitor import QUIET, Monitor
-from engram.robot import localise_drive, open_drive, open_map
-from engram.sequences.trajectories import read_tum
+from engram.robot.starting import localise_drive
+from engram.sequences.motion import read_tum
+from engram.sequences.opening import open_drive
 
 _DATA = Path(__file__).parent / "data"
 

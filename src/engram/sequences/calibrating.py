@@ -9,13 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.calibration import Cameras, read_calibration
+from engram.calibration.cameras import Cameras
+from engram.calibration.formats import read_calibration
 from engram.errors import CalibrationError, ConfigError, InputError
-from engram.frontend import StereoPair
-from engram.frontend.sides import match_sides
+from engram.frontend.features import match_sides
+from engram.frontend.frame import StereoPair
 from engram.sequences.images import image_size, read_image
 from engram.sequences.listing import image_files
-from engram.sequences.options import OpenOptions
+from engram.sequences.sequence import OpenOptions
 
 # Disparities below this have no sign, px; so many others tell left from right, and such a share of
 # them is negative where the two are exchanged.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import ConfigError, SequenceError
-from engram.sequences.options import Channel
+from engram.sequences.sequence import Channel
 from engram.untrusted import read_bytes
 
 # File types that OpenCV's wheels decode. Other files beside the images are ignored.

@@ -18,20 +18,29 @@ from engram.errors import ConfigError, SequenceError
 from engram.files import check_there
 from engram.keywords import keywords
 from engram.plugins import PluginGroup, check_is
-from engram.sequences.bags import BagSequence, is_bag, open_bag
+from engram.sequences.bags.containers import is_bag
+from engram.sequences.bags.sequence import BagSequence, open_bag
 from engram.sequences.clocks import StampReport
-from engram.sequences.euroc import find_euroc, find_tumvi, is_euroc, is_tumvi
-from engram.sequences.folder import TEMPLATE, find_folder, is_folder
-from engram.sequences.framelog import FrameLog, is_framelog, open_framelog
-from engram.sequences.image_sequence import ImageDrive, ImageSequence
+from engram.sequences.framelog.reader import FrameLog, is_framelog, open_framelog
 from engram.sequences.images import IMAGE_SUFFIXES
-from engram.sequences.kitti import (
+from engram.sequences.layouts import (
+    TEMPLATE,
+    ImageDrive,
+    ImageSequence,
+    find_euroc,
+    find_folder,
     find_kitti_odometry,
     find_kitti_raw,
+    find_robotcar,
+    find_tumvi,
+    is_euroc,
+    is_folder,
     is_kitti_odometry,
     is_kitti_raw,
+    is_robotcar,
+    is_tumvi,
 )
-from engram.sequences.options import (
+from engram.sequences.sequence import (
     PAIR_TOLERANCE_NS,
     Channel,
     FrameRange,
@@ -42,7 +51,6 @@ from engram.sequences.options import (
     parse_choice,
     parse_time,
 )
-from engram.sequences.robotcar import find_robotcar, is_robotcar
 
 Drive: TypeAlias = ImageSequence | BagSequence | FrameLog
 

@@ -1,19 +1,26 @@
-"""The two protocols of all data sources, and the identity of a drive."""
+"""The two protocols of all data sources, and options for opening a drive."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Protocol, TypeAlias, TypeVar, runtime_checkable
 
 import numpy as np
+from msgspec import Meta
 
-from engram.errors import InputError
-from engram.frontend import Frame, StereoPair
-from engram.geometry import StereoCamera
+from engram.config import check_bounds
+from engram.errors import ConfigError, InputError
+from engram.frontend.frame import Frame, StereoPair
+from engram.geometry.cameras import StereoCamera
+from engram.graph.clock import check_longitude, check_zone
 from engram.graph.model import LONGEST_NAME, Clock, Session, session_id
-from engram.odometry import OdometryStep
+from engram.odometry.step import OdometryStep
 
 # Robot name of a drive if neither source nor caller gives one.
 UNNAMED_ROBOT = "robot"
@@ -145,3 +152,264 @@ def session_of(
         longitude_deg=info.longitude_deg,
         zone=info.zone,
     )
+
+
+T = TypeVar("T")
+E = TypeVar("E", bound=StrEnum)
+
+Moment: TypeAlias = str | float | int | datetime
+"""A moment of a drive: seconds from its first frame (float, or such text), or a time: ISO 8601,
+`datetime`, or ns since 1970 (int)."""
+
+_PART = re.compile(r"[0-9]{1,9}")
+_SECONDS = re.compile(r"[0-9]{1,9}(\.[0-9]{0,9})?")
+_MICROSECOND = timedelta(microseconds=1)
+_SPELLINGS = {"color": "colour", "gray": "grey"}
+
+
+class Rig(StrEnum):
+    """Which of a robot's two stereo rigs; layouts with one rig only have `GREY`."""
+
+    GREY = "grey"
+    COLOUR = "colour"
+
+
+class Channel(StrEnum):
+    """How a colour image becomes grey: its luma, or one channel."""
+
+    GREY = "grey"
+    RED = "red"
+    GREEN = "green"
+    BLUE = "blue"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRange:
+    """Frames `start`, `start + step`, … below `stop`, counted from 0 in the layout's own order.
+
+    Bad frames keep their numbers, so that a range names the same frames with and
+    without `skip_bad`.
+
+    Attributes:
+        start: first frame, >= 0.
+        stop: end, not included; None for all the rest.
+        step: distance of successive frames, >= 1.
+
+    Raises:
+        ConfigError: a part is negative, the step is 0, or stop is not after start.
+    """
+
+    start: int = 0
+    stop: int | None = None
+    step: int = 1
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or (self.stop is not None and self.stop < 0) or self.step < 1:
+            raise ConfigError(
+                f"frames {self}: start and stop must be >= 0 and step >= 1 "
+                "(counting from the end is not supported)"
+            )
+        if self.stop is not None and self.stop <= self.start:
+            raise ConfigError(f"frames {self}: holds no frame, stop must be larger than start")
+
+    @staticmethod
+    def parse(text: str) -> FrameRange:
+        """Read START:STOP:STEP, the words of a Python slice; any part may be missing.
+
+        A single number N means the one frame N.
+
+        Raises:
+            ConfigError: the text is not a range.
+        """
+        parts = [part.strip() for part in text.split(":")]
+        if len(parts) > 3 or text.strip() == "":
+            raise ConfigError(f"frames {text!r}: write START:STOP:STEP, such as 0:100:2")
+        for part in parts:
+            if part and not _PART.fullmatch(part):
+                why = "is not valid" if part[0] != "-" else "counts from the end: not supported"
+                raise ConfigError(
+                    f"frames {text!r}: {part!r} {why}; each part is a whole number >= 0 or missing"
+                )
+        start = int(parts[0] or 0)
+        if len(parts) == 1:
+            return FrameRange(start, start + 1)
+        stop = int(parts[1]) if parts[1] else None
+        return FrameRange(start, stop, int(parts[2]) if len(parts) == 3 and parts[2] else 1)
+
+    def __str__(self) -> str:
+        return f"{self.start}:{'' if self.stop is None else self.stop}:{self.step}"
+
+    def indices(self, length: int) -> range:
+        """The frames of a drive of `length` frames that are in the range."""
+        return range(length)[self.start : self.stop : self.step]
+
+    def of(self, items: Sequence[T]) -> list[T]:
+        """The members of `items` that are in the range."""
+        return [items[index] for index in self.indices(len(items))]
+
+
+@dataclass(frozen=True, slots=True)
+class TimeRange:
+    """A stretch of a drive in time.
+
+    Attributes:
+        start, stop: its ends, both included; seconds from the drive's first frame (float), or ns
+            since 1970 (int); None for the drive's own ends.
+
+    Raises:
+        ConfigError: the range is empty.
+    """
+
+    start: float | int | None = None
+    stop: float | int | None = None
+
+    def __post_init__(self) -> None:
+        start, stop = self.start, self.stop
+        if start is not None and stop is not None and type(start) is type(stop) and stop < start:
+            raise ConfigError(f"--from {start} is after --to {stop}: no frame lies between")
+
+    @staticmethod
+    def parse(start: Moment | None, stop: Moment | None) -> TimeRange:
+        """Reads seconds such as 12.5, or times such as 2026-03-01T09:30:00Z (UTC).
+
+        Raises:
+            ConfigError: a text is neither.
+        """
+        return TimeRange(_moment("--from", start), _moment("--to", stop))
+
+    @property
+    def is_all(self) -> bool:
+        """Whether it is the whole drive."""
+        return self.start is None and self.stop is None
+
+    def holds(self, stamp_ns: int, first_ns: int) -> bool:
+        """Whether a stamp of a drive that begins at `first_ns` is inside."""
+        return not (self.is_before(stamp_ns, first_ns) or self.is_after(stamp_ns, first_ns))
+
+    def is_before(self, stamp_ns: int, first_ns: int) -> bool:
+        """Whether a stamp lies before the range."""
+        return self.start is not None and stamp_ns < _as_ns(self.start, first_ns)
+
+    def is_after(self, stamp_ns: int, first_ns: int) -> bool:
+        """Whether a stamp lies after the range."""
+        return self.stop is not None and stamp_ns > _as_ns(self.stop, first_ns)
+
+
+def _as_ns(moment: float | int, first_ns: int) -> int:
+    return moment if isinstance(moment, int) else first_ns + round(moment * 1e9)
+
+
+def _moment(option: str, given: Moment | None) -> float | int | None:
+    if isinstance(given, float):
+        return given
+    if isinstance(given, str) and _SECONDS.fullmatch(given.strip()):
+        return float(given)
+    try:
+        return parse_time(option, given)
+    except ConfigError:
+        raise ConfigError(
+            f"{option} {given!r}: write seconds from the drive's start, such as 12.5, or a time "
+            "such as 2026-03-01T09:30:00Z"
+        ) from None
+
+
+# Software-triggered pairs stay below it, and it is half of the frame interval at 100 Hz.
+PAIR_TOLERANCE_NS = 5_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class OpenOptions:
+    """How to open a drive.
+
+    Attributes:
+        rig: which rig, if the layout has two.
+        channel: how colour images become grey.
+        frames: which frames are used.
+        skip_bad: leave out bad pairs and count them, instead of failing.
+        pair_tolerance_ns: largest difference of stamps within a pair, ns, for layouts that pair by
+            stamp.
+        robot: name of the robot; None for that of the source.
+        recorded_at_ns: time of the drive's first frame, ns since 1970 UTC, for a drive whose clock
+            is not UTC.
+        longitude_deg, zone: where the drive was; None for the source's value.
+        times: which stretch of the drive is used.
+        calibration: file of the stereo pair's calibration; None for the drive's own.
+        field_of_view_deg: horizontal field of view of rectified images; None for the largest.
+        mask: image that is black where the robot sees itself; None for none.
+        left, right: topics of a bag's images; None finds them by their names.
+        motion: topics or files of odometry and gyroscope.
+
+    Raises:
+        ConfigError: the longitude is outside ±180°, the zone is unknown, the tolerance negative.
+    """
+
+    rig: Rig = Rig.GREY
+    channel: Channel = Channel.GREY
+    frames: FrameRange = field(default_factory=FrameRange)
+    skip_bad: bool = False
+    pair_tolerance_ns: Annotated[int, Meta(ge=0)] = PAIR_TOLERANCE_NS
+    robot: str | None = None
+    recorded_at_ns: int | None = None
+    longitude_deg: float | None = None
+    zone: str | None = None
+    times: TimeRange = field(default_factory=TimeRange)
+    calibration: Path | None = None
+    field_of_view_deg: Annotated[float | None, Meta(ge=10, le=170)] = None
+    mask: Path | None = None
+    left: str | None = None
+    right: str | None = None
+    motion: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.frames, FrameRange):
+            raise ConfigError(f"frames is {self.frames!r}, must be text such as 0:100:2")
+        if self.robot is not None:
+            check_name(self.robot)
+        check_longitude(self.longitude_deg)
+        check_zone(self.zone)
+        check_bounds(self)
+
+
+def parse_choice(kind: type[E], text: str) -> E:
+    """A `Rig` or `Channel` by name, in British or American spelling.
+
+    Raises:
+        ConfigError: there is no such name.
+    """
+    try:
+        return kind(_SPELLINGS.get(text, text))
+    except ValueError:
+        raise ConfigError(
+            f"{kind.__name__.lower()} {text!r} is unknown; known: {', '.join(kind)}"
+        ) from None
+
+
+def parse_time(name: str, given: str | datetime | int | None) -> int | None:
+    """A time as ns since 1970: an ISO 8601 text, a `datetime`, or the ns themselves.
+
+    A time without an offset is taken as UTC.
+
+    Args:
+        name: the option or keyword, for the error.
+        given: the time; None gives None.
+
+    Raises:
+        ConfigError: the text is not an ISO 8601 time, or the time lies before 1970.
+    """
+    if given is None:
+        return None
+    time = given
+    if isinstance(time, str):
+        try:
+            time = datetime.fromisoformat(time)
+        except ValueError:
+            raise ConfigError(
+                f"{name} {given!r} is not an ISO 8601 time such as 2011-09-26T13:02:25Z"
+            ) from None
+    if isinstance(time, datetime):
+        aware = time if time.tzinfo else time.replace(tzinfo=UTC)
+        # Whole microseconds: `timestamp()` is a float and would lose the last digits.
+        time = (aware - datetime(1970, 1, 1, tzinfo=UTC)) // _MICROSECOND * 1000
+    if not 0 <= time < 2**63:
+        raise ConfigError(f"{name} is {time} ns since 1970, must be between 1970 and 2262")
+    return time

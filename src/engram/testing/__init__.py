@@ -10,9 +10,6 @@ For the tests of Engram and of packages that add to it::
 Nothing here needs a test framework.
 """
 
-from engram.testing.checks import Check, unmet
-from engram.testing.features import check_kind
-from engram.testing.policies import check_policy
-from engram.testing.readers import check_reader
+from engram.testing.contracts import Check, check_kind, check_policy, check_reader, unmet
 
 __all__ = ["Check", "check_kind", "check_policy", "check_reader", "unmet"]

@@ -1,21 +1,171 @@
-"""Pictures of matches along a drive: `localise --pictures`."""
+"""Pictures of maps from above, of matches and of stereo pairs."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
+from types import MappingProxyType, ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.errors import InputError
-from engram.frontend import Frame, StereoPair
-from engram.localiser import Localisation
-from engram.localiser.attempts import Outcome
-from engram.localiser.choice import outcome_at
+from engram.counts import counted
+from engram.doctor.examination import align
+from engram.errors import InputError, MissingExtraError
+from engram.files import check_output
+from engram.frontend.features import match_sides
+from engram.frontend.frame import Frame, StereoPair
+from engram.graph.clock import hour_of_day
+from engram.graph.model import Clock, Node, Session
+from engram.localiser.attempts import Outcome, outcome_at
+from engram.localiser.localisation import Localisation
+from engram.maps.difference import MapDifference
 from engram.maps.frame_reader import FrameReader
+from engram.maps.map import Map
 from engram.robot.robot import Seen
-from engram.viewing import match_picture
+from engram.untrusted import printable
+
+
+def matplotlib_for_files() -> ModuleType:
+    """Matplotlib without a window.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
+    try:
+        import matplotlib
+        import matplotlib.figure
+    except ImportError as error:
+        raise MissingExtraError(
+            "pictures need Matplotlib: pip install 'engram-localisation[plots]'"
+        ) from error
+    matplotlib.use("Agg")
+    return matplotlib
+
+
+def subplots(count: int, *, width: float, height: float, rows: int = 1) -> tuple[Any, list[Any]]:
+    """A figure with `count` axes in `rows` rows, of which the last may be shorter.
+
+    Width and height are those of the figure, in inches.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
+    """
+    matplotlib_for_files()
+    from matplotlib import pyplot
+
+    columns = -(-count // rows)
+    figure, axes = pyplot.subplots(
+        rows, columns, figsize=(width, height), layout="constrained", squeeze=False
+    )
+    every = list(np.ravel(axes))
+    for unused in every[count:]:
+        unused.remove()
+    return figure, every[:count]
+
+
+def save(figure: Any, path: Path) -> None:
+    """Writes the figure and releases its memory.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    from matplotlib import pyplot
+
+    try:
+        figure.savefig(path, dpi=120)
+    except (OSError, ValueError) as error:  # no such folder; an unknown file extension
+        raise InputError(f"the picture {path} cannot be written: {error}") from error
+    finally:
+        pyplot.close(figure)
+
+
+Image = NDArray[np.uint8]
+
+_MATCH_GAP_PX = 8
+_MATCH_CAPTION_PX = 28
+# Lines over everything hide the images: this many show how they lie to each other.
+_MATCH_LINES = 12
+# Images that are wider than this times their height lie one above the other.
+_WIDE = 1.6
+_WHITE = (230, 230, 230)
+
+
+def match_picture(
+    node_image: Image,
+    live_image: Image,
+    node_pixels: NDArray[np.float32],
+    live_pixels: NDArray[np.float32],
+    caption: str,
+) -> Image:
+    """Node and live image, named, in the live image's size; wide ones one above the other.
+
+    Args:
+        node_image: (h, w) uint8 grey, any size; enlarged to that of the live image.
+        live_image: (H, W) uint8 grey.
+        node_pixels: (K, 2) float32, positions in the node's image as fractions of its width and
+            height.
+        live_pixels: (K, 2) float32, positions in the live image, px.
+        caption: text below the images.
+
+    Returns:
+        (H', W', 3) uint8 BGR.
+    """
+    height, width = live_image.shape
+    enlarged = cv2.resize(node_image, (width, height), interpolation=cv2.INTER_CUBIC)
+    stacked = width > _WIDE * height
+    shift = np.array([0, height + _MATCH_GAP_PX] if stacked else [width + _MATCH_GAP_PX, 0])
+    canvas = np.zeros((*(np.array([height, width]) + shift[::-1]), 3), dtype=np.uint8)
+    canvas[:height, :width] = enlarged[..., None]
+    canvas[shift[1] :, shift[0] :] = live_image[..., None]
+    ends = np.round(live_pixels).astype(int) + shift
+    starts = np.round(node_pixels * (width, height)).astype(int)
+    for one in _spread(live_pixels):
+        colour = _colour(float(live_pixels[one, 1]) / height)
+        cv2.line(canvas, tuple(starts[one]), tuple(ends[one]), colour, 1, cv2.LINE_AA)
+    for start, end, live in zip(starts, ends, live_pixels, strict=True):
+        colour = _colour(float(live[1]) / height)
+        for centre in (start, end):
+            cv2.circle(canvas, tuple(centre), 2, colour, -1, cv2.LINE_AA)
+    _write_name(canvas, "node", np.array([0, 0]))
+    _write_name(canvas, "live", shift)
+    below = np.zeros((_MATCH_CAPTION_PX, canvas.shape[1], 3), dtype=np.uint8)
+    _write(below, caption, (6, _MATCH_CAPTION_PX - 9))
+    return np.concatenate([canvas, below])
+
+
+def _spread(pixels: NDArray[np.float32]) -> list[int]:
+    """A few of the points, far from each other: each the farthest from those before it."""
+    if not len(pixels):
+        return []
+    chosen = [0]
+    distance = np.linalg.norm(pixels - pixels[0], axis=1)
+    while len(chosen) < min(_MATCH_LINES, len(pixels)):
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(pixels - pixels[chosen[-1]], axis=1))
+    return chosen
+
+
+def _write_name(canvas: Image, name: str, corner: NDArray[np.int_]) -> None:
+    x, y = (int(one) for one in corner)
+    cv2.rectangle(canvas, (x, y), (x + 46, y + 20), (0, 0, 0), -1)
+    _write(canvas, name, (x + 5, y + 15))
+
+
+def _write(canvas: Image, text: str, at: tuple[int, int]) -> None:
+    cv2.putText(canvas, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _WHITE, 1, cv2.LINE_AA)
+
+
+def _colour(fraction: float) -> tuple[int, int, int]:
+    """A hue from top to bottom of the image, so that crossing lines stand out."""
+    hue = np.array([[[int(170 * min(max(fraction, 0.0), 1.0)), 220, 255]]], dtype=np.uint8)
+    blue, green, red = cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0]
+    return int(blue), int(green), int(red)
 
 
 class PictureWriter:
@@ -83,3 +233,308 @@ class PictureWriter:
             live.landmarks.pixels[match.live_rows] * np.float32(scale),
             caption,
         )
+
+
+_SHARED_LINES = 40
+# Matches whose rows differ by more than this, or that lie further right in the right image.
+_OFF_PX = 1.5
+_GOOD, _BAD = (120, 220, 120), (70, 70, 255)
+
+
+def side_picture(pair: StereoPair) -> NDArray[np.uint8]:
+    """Left above right, (2h, w, 3) uint8 BGR; lines join what both show, red if that is wrong.
+
+    Matches that contradict the pair's alignment are left out, as the doctor leaves them out.
+    """
+    matches, height = match_sides(pair), pair.camera.height
+    aligned = align(matches, pair.camera)
+    matches = matches if aligned is None else aligned.agreeing
+    both = np.concatenate([pair.left, pair.right])
+    picture = cv2.cvtColor(both, cv2.COLOR_GRAY2BGR)
+    chosen = np.linspace(0, len(matches) - 1, min(_SHARED_LINES, len(matches))).astype(int)
+    for k in chosen.tolist():
+        pixel, shift = matches.pixels[k], matches.shift[k]
+        bad = abs(shift[1]) > _OFF_PX or shift[0] < -_OFF_PX
+        right = pixel - shift + [0, height]
+        colour = _BAD if bad else _GOOD
+        ends = [tuple(int(value) for value in np.rint(end)) for end in (pixel, right)]
+        cv2.line(picture, ends[0], ends[1], colour, 1, cv2.LINE_AA)
+    return np.asarray(picture, np.uint8)
+
+
+def fixed_picture(pair: StereoPair, seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The left image, (h, w, 3) uint8 BGR, red where it moves with the camera.
+
+    Args:
+        pair: the images.
+        seen: (h, w) bool, False where the image moves with the camera.
+    """
+    picture = cv2.cvtColor(pair.left, cv2.COLOR_GRAY2BGR)
+    tinted = 0.5 * picture + 0.5 * np.array(_BAD)
+    return np.where(seen[..., None], picture, tinted).astype(np.uint8)
+
+
+_EPIPOLAR_LINES = 16
+_PAIR_GAP_PX = 4
+_PAIR_CAPTION_PX = 26
+# Matched corners that are this far apart in height are no match, px.
+_MOST_ROWS_PX = 20.0
+# ORB descriptors that differ in more bits are of different points.
+_MOST_BITS = 32
+
+
+def row_offsets_px(pair: StereoPair) -> NDArray[np.float64]:
+    """(N,) heights of matched corners in the left image minus those in the right, px.
+
+    Near 0 throughout for a good calibration. Independent of the front-end, which only searches
+    along the row.
+    """
+    orb = cv2.ORB.create(1500)
+    (left, left_codes), (right, right_codes) = (
+        orb.detectAndCompute(image, None) for image in (pair.left, pair.right)
+    )
+    if not (len(left) and len(right)):
+        return np.zeros(0)
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left_codes, right_codes)
+    offsets = [
+        left[one.queryIdx].pt[1] - right[one.trainIdx].pt[1]
+        for one in matches
+        if one.distance <= _MOST_BITS
+    ]
+    found = np.array(offsets, dtype=np.float64)
+    return found[np.abs(found) <= _MOST_ROWS_PX]
+
+
+def rectified_picture(pair: StereoPair, caption: str) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 BGR: left and right image, and the rows that a point of one lies on."""
+    height, width = pair.left.shape
+    canvas = np.zeros((height + _PAIR_CAPTION_PX, 2 * width + _PAIR_GAP_PX, 3), dtype=np.uint8)
+    left = pair.left if pair.mask is None else np.where(pair.mask, pair.left, pair.left // 3)
+    canvas[:height, :width] = left[..., None]
+    canvas[:height, width + _PAIR_GAP_PX :] = pair.right[..., None]
+    for number in range(1, _EPIPOLAR_LINES):
+        row = number * height // _EPIPOLAR_LINES
+        hue = np.array([[[170 * number // _EPIPOLAR_LINES, 200, 255]]], dtype=np.uint8)
+        colour = tuple(int(one) for one in cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0])
+        cv2.line(canvas, (0, row), (2 * width + _PAIR_GAP_PX, row), colour, 1)
+    for text, column in ((f"left   {caption}", 6), ("right", width + _PAIR_GAP_PX + 6)):
+        origin = (column, height + _PAIR_CAPTION_PX - 8)
+        cv2.putText(
+            canvas, text, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (230, 230, 230), 1, cv2.LINE_AA
+        )
+    return canvas
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """One line of the picture.
+
+    Attributes:
+        label: label in the legend.
+        points_m: (N, 2) float64, x and y in the map frame, metres.
+        colour: Matplotlib colour; None for the next of a series.
+    """
+
+    label: str
+    points_m: NDArray[np.float64]
+    colour: str | None = None
+
+
+def draw_from_above(
+    tracks: Sequence[Track],
+    path: Path,
+    title: str,
+    marks: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+) -> None:
+    """Draws tracks from above into an image file.
+
+    Args:
+        tracks: the lines.
+        path: image file.
+        title: title of the picture.
+        marks: places with their names, x and y, metres.
+
+    Raises:
+        InputError: the file cannot be written.
+        MissingExtraError: Matplotlib is not installed.
+    """
+    draw_panels([(title, tracks)], path, marks)
+
+
+def draw_panels(
+    panels: Sequence[tuple[str, Sequence[Track]]],
+    path: Path,
+    marks: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+) -> None:
+    """Draws tracks from above, side by side.
+
+    Args:
+        panels: title and tracks of each; a label has the same colour in all of them.
+        path: image file.
+        marks: places with their names in every panel, x and y, metres.
+
+    Raises:
+        InputError: the file cannot be written.
+        MissingExtraError: Matplotlib is not installed.
+    """
+    names = dict.fromkeys(_track_name(track) for _, tracks in panels for track in tracks)
+    colours = {name: f"C{number % 10}" for number, name in enumerate(names)}
+    figure, all_axes = subplots(len(panels), width=7 * len(panels), height=6)
+    for axes, (title, tracks) in zip(all_axes, panels, strict=True):
+        for track in tracks:
+            x, y = track.points_m[:, 0], track.points_m[:, 1]
+            colour = track.colour or colours[_track_name(track)]
+            axes.plot(x, y, ".", color=colour, markersize=5, label=_shown(track.label))
+        for name, place in marks.items():
+            axes.plot(*place, "*", color="black", markersize=9)
+            axes.annotate(
+                _shown(name), place, xytext=(5, 5), textcoords="offset points", fontsize=8
+            )
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set_xlabel("x, m")
+        axes.set_ylabel("y, m")
+        axes.set_title(_shown(title))
+        if tracks:
+            axes.legend(fontsize=8, loc="best")
+    save(figure, path)
+
+
+def _shown(text: str) -> str:
+    """A text of a stranger's map: without control characters and Matplotlib's formulas."""
+    return printable(text).replace("$", r"\$")
+
+
+def _track_name(track: Track) -> str:
+    """The label of a track without its count."""
+    return track.label.split(" (")[0]
+
+
+def check_picture(path: Path) -> None:
+    """Checks before the work whether a picture can be written to a path.
+
+    Raises:
+        InputError: the folder does not exist or is not writable, or the file extension is unknown.
+        MissingExtraError: Matplotlib is not installed.
+    """
+    check_output(path)
+    formats = matplotlib_for_files().figure.Figure().canvas.get_supported_filetypes()
+    ending = path.suffix.removeprefix(".").lower()
+    if ending not in formats:  # Matplotlib would write another file, NAME.png
+        raise InputError(
+            f"the picture {path} cannot be written: .{ending} is not one of {', '.join(formats)}"
+        )
+
+
+# A legend longer than this hides the map.
+_NAMED = 12
+_FEW = "0.7"
+
+
+def _experience(opened: Map, node: Node) -> str:
+    session = opened.sessions[node.session]
+    if session.clock is Clock.UTC:
+        start = datetime.fromtimestamp(session.start_ns / 1e9, UTC)
+        return f"{session.robot}, {start:%Y-%m-%d %H:%M}"
+    return f"{session.robot}, {str(session.id)[:8]}"
+
+
+def _hour(opened: Map, node: Node) -> str:
+    session: Session = opened.sessions[node.session]
+    hour = hour_of_day(session, node.stamp_ns)
+    return "hour unknown" if hour is None else f"{int(hour):02d} h"
+
+
+def _revision(opened: Map, node: Node) -> str:
+    return f"revision {opened.origin(str(node.id)).brought:3d}"
+
+
+def _robot(opened: Map, node: Node) -> str:
+    return opened.sessions[node.session].robot
+
+
+COLOURS: Mapping[str, Callable[[Map, Node], str]] = {
+    "experience": _experience,
+    "hour": _hour,
+    "revision": _revision,
+    "robot": _robot,
+}
+
+
+def plot_map(path: Path, out: Path, by: str = "experience", at: int | str | None = None) -> int:
+    """Draws a map and its goals from above, in the map frame.
+
+    Relative positions are accurate locally; over long distances they drift with odometry, where no
+    anchors hold them. Unconnected components stand side by side.
+
+    Args:
+        path: NAME.engram.
+        out: image file.
+        by: key of `COLOURS`.
+        at: number or tag of the revision; None for the newest.
+
+    Returns:
+        Number of nodes drawn.
+
+    Raises:
+        MapError: the map cannot be read, or has no such revision.
+        InputError: the picture cannot be written.
+        MissingExtraError: Matplotlib is not installed.
+    """
+    check_picture(out)
+    with Map.open(path, at=at) as opened:
+        points = opened.frame.positions[:, :2]
+        labels = np.array([COLOURS[by](opened, node) for node in opened.graph.nodes], dtype=str)
+        counts = Counter(labels.tolist())
+        largest = {label for label, _ in counts.most_common(_NAMED)}
+        tracks = [
+            Track(f"{label} ({counted(counts[label], 'node')})", points[labels == label])
+            for label in sorted(largest)
+        ]
+        rest = [label for label in counts if label not in largest]
+        if rest:
+            points_of_rest = points[np.isin(labels, rest)]
+            tracks.append(
+                Track(
+                    f"{len(rest)} more ({counted(len(points_of_rest), 'node')})",
+                    points_of_rest,
+                    _FEW,
+                )
+            )
+        places = {name: opened.frame.locate(goal) for name, goal in opened.goals.items()}
+        marks = {name: (place.x_m, place.y_m) for name, place in sorted(places.items())}
+        title = f"{path.name}, revision {opened.revision}, by {by}"
+        draw_from_above(tracks, out, title, marks)
+        return len(labels)
+
+
+def draw_difference(map_path: Path, difference: MapDifference, path: Path) -> None:
+    """Draws the unchanged, added and removed parts between two revisions, in the map frame.
+
+    Args:
+        map_path: the map that was compared.
+        difference: of two of its revisions.
+        path: image file.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
+    """
+    graph = difference.graph
+    points = np.zeros((len(graph), 2))
+    for revision in (difference.before, difference.after):  # a node that moved is where it is now
+        with Map.open(map_path, at=revision) as opened:
+            at = [graph.index(node.id) for node in opened.graph.nodes]
+            points[at] = opened.frame.positions[:, :2]
+    old = np.zeros(len(graph), bool)
+    new = np.zeros(len(graph), bool)
+    old[[graph.index(node.id) for node in difference.old.nodes]] = True
+    new[[graph.index(node.id) for node in difference.new.nodes]] = True
+    tracks = [
+        Track(f"{label}: {counted(int(mask.sum()), 'node')}", points[mask], colour)
+        for label, mask, colour in (
+            ("in both", old & new, "0.6"),
+            ("added", new & ~old, "tab:green"),
+            ("removed", old & ~new, "tab:red"),
+        )
+        if mask.any()
+    ]
+    draw_from_above(tracks, path, f"Revision {difference.before} → {difference.after}")

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.graph import ChainTree, ExperienceGraph
 from engram.graph.model import NodeId
-from engram.localiser import Localisation
-from engram.sequences.trajectories import Trajectory, write_tum
+from engram.localiser.localisation import Localisation
+from engram.sequences.motion import Trajectory, write_tum
 
 HEADER = (
     "timestamp x y z qx qy qz qw; seconds, metres; frame: camera of the first localised node",

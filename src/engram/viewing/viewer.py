@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError, MissingExtraError
-from engram.frontend import StereoPair
+from engram.frontend.frame import StereoPair
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import SessionId
-from engram.localiser import Localisation, LocalisationStatus
-from engram.localiser.choice import outcome_at
-from engram.maps import Map
-from engram.robot.robot import Robot, Seen
-from engram.robot.whereabouts import Whereabouts
+from engram.localiser.attempts import outcome_at
+from engram.localiser.localisation import Localisation, LocalisationStatus
+from engram.maps.map import Map
+from engram.robot.robot import Robot, Seen, Whereabouts
 from engram.untrusted import printable
 
 _STATUS_COLOURS = {

@@ -16,10 +16,18 @@ from uuid import UUID
 import numpy as np
 from tests.maps.maps import begin, edge, session, write_drive
 
-from engram.geometry import SE3
-from engram.graph.marks import Anchor, Goal, Placement, Removal
-from engram.graph.model import Amendable, EdgeKind, NodeId, Omission
-from engram.maps import Map
+from engram.geometry.se3 import SE3
+from engram.graph.model import (
+    Amendable,
+    Anchor,
+    EdgeKind,
+    Goal,
+    NodeId,
+    Omission,
+    Placement,
+    Removal,
+)
+from engram.maps.map import Map
 
 OMITTED = NodeId(UUID(int=3))
 AUTHOR = "tests"

@@ -7,7 +7,9 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
-from engram.frontend import Frame, Frontend, MatcherConfig, StereoPair, match_frames
+from engram.frontend.frame import Frame, StereoPair
+from engram.frontend.frontend import Frontend
+from engram.frontend.matching import MatcherConfig, match_frames
 from engram.sequences.opening import open_drive
 from engram_lab.bench.data import BenchData, scale_and_crop
 

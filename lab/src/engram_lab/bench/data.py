@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import StereoPair
-from engram.geometry import StereoCamera
+from engram.frontend.frame import StereoPair
+from engram.geometry.cameras import StereoCamera
 from engram.sequences.opening import open_drive
 
 _SMALL_WIDTH_PX, _SMALL_HEIGHT_PX = 512, 384

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.geometry import SE3
-from engram.graph.attempts import Attempts
+from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, path_id
-from engram.maps import Map, RevisionWriter
+from engram.graph.paths import Attempts
+from engram.maps.map import Map
+from engram.maps.writer import RevisionWriter
 from engram_lab.bench.data import BenchData
 from engram_lab.bench.plain import PlainPipeline
 from engram_lab.bench.stage import Prepared

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import BRIEF
-from engram.places import (
-    FabMap,
+from engram.frontend.frame import BRIEF
+from engram.places.recognisers import FabMap
+from engram.places.vocabulary import (
     TrainingConfig,
     TreeArrays,
     Vocabulary,

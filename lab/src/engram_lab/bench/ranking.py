@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.ranking import RankingContext, policy_named
+from engram.ranking.context import RankingContext
+from engram.ranking.policies import policy_named
 from engram_lab.bench.data import BenchData
 from engram_lab.bench.plain import PlainPipeline
 from engram_lab.bench.stage import Prepared

@@ -5,7 +5,8 @@ from __future__ import annotations
 from engram_lab.bench.data import BenchData
 from engram_lab.bench.plain import PlainPipeline
 from engram_lab.bench.stage import Prepared
-from engram_lab.town import SimulatedDrive, campaign_named
+from engram_lab.town.campaigns import campaign_named
+from engram_lab.town.session import SimulatedDrive
 
 CLEAR, RAIN, NIGHT = 1, 6, 7  # sessions of `village`: a morning, wet streets, lamps
 _FIRST_FRAME, _FRAMES = 200, 60

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from engram.frontend import Frontend, StereoPair
-from engram.geometry import StereoCamera
-from engram.odometry import Odometry, OdometryConfig, WindowConfig
+from engram.frontend.frame import StereoPair
+from engram.frontend.frontend import Frontend
+from engram.geometry.cameras import StereoCamera
+from engram.odometry.odometry import Odometry, OdometryConfig, WindowConfig
 from engram_lab.bench.attempts import attempts_at, hopeless
 from engram_lab.bench.data import BenchData, to_and_fro
 from engram_lab.bench.opening import prepare_opening

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.frontend import StereoPair
-from engram.geometry import SE3
-from engram.localiser import Position
-from engram.maps import Map, open_map
-from engram.robot import Settings
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
+from engram.localiser.localisation import Position
+from engram.maps.map import Map, open_map
+from engram.robot.settings import Settings
 from engram_lab.bench.data import BenchData
 from engram_lab.bench.plain import PlainPipeline
 from engram_lab.bench.stage import Prepared, Run

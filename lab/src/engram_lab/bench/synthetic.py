@@ -7,25 +7,14 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.geometry import CameraId
-from engram.graph.attempts import Attempts
+from engram.geometry.cameras import CameraId
 from engram.graph.basin import MatchBasin
 from engram.graph.graph import ExperienceGraph
-from engram.graph.model import (
-    Node,
-    PathEntry,
-    PathEntryKind,
-    PathId,
-    SessionId,
-    node_id,
-)
+from engram.graph.model import Node, PathEntry, PathEntryKind, PathId, SessionId, node_id
 from engram.graph.neighbourhood import Neighbourhood
-from engram.graph.paths import PathMemory
-from engram.ranking.background import Background
-from engram.ranking.context import RankingContext
-from engram.ranking.lessons import Lessons
-from engram.ranking.recent import Observations
-from engram.ranking.run import RunAttempts
+from engram.graph.paths import Attempts, PathMemory
+from engram.ranking.context import Background, Lessons, RankingContext
+from engram.ranking.recent import Observations, RunAttempts
 
 _CAMERA = CameraId("0" * 32)
 # A lens whose basin holds the whole search radius: every candidate is to be scored.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from engram import _core
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram_lab.bench.data import BenchData
 from engram_lab.bench.plain import PlainPipeline
 from engram_lab.bench.stage import Prepared

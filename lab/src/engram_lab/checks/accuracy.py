@@ -15,18 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from engram.frontend import (
-    Frame,
-    Frontend,
-    FrontendConfig,
-    Match,
-    MatcherConfig,
-    StereoPair,
-    match_frames,
-)
-from engram.geometry import SE3
-from engram.odometry import Odometry, OdometryConfig
-from engram.sequences import open_drive
+from engram.frontend.frame import Frame, StereoPair
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.frontend.matching import Match, MatcherConfig, match_frames
+from engram.geometry.se3 import SE3
+from engram.odometry.odometry import Odometry, OdometryConfig
+from engram.sequences.opening import open_drive
 from engram_lab.programs import Figure, command_line, report
 
 KITTI_06 = "kitti_odometry/sequences/06"

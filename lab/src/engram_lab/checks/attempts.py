@@ -20,9 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.cli.progress import Bars
-from engram.frontend import Frame, Frontend, FrontendConfig, MatcherConfig, match_frames
-from engram.geometry import SE3
+from engram.cli.screen import Bars
+from engram.frontend.frame import Frame
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.frontend.matching import MatcherConfig, match_frames
+from engram.geometry.se3 import SE3
 from engram.monitor import Monitor, write_whole
 from engram_lab.checks import eyes_real
 from engram_lab.checks.eyes import LEAST_INLIERS, PAIRS, TOWNS, WITHIN_M, between, error_m

@@ -16,10 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.calibration import Cameras
+from engram.calibration.cameras import Cameras
 from engram.calibration.toml import calibration_toml
-from engram.geometry import StereoCamera
-from engram.robot import open_drive
+from engram.geometry.cameras import StereoCamera
+from engram.sequences.opening import open_drive
 from engram_lab.checks.euroc_bag import Pictures, write_bag
 
 _WIDTH, _HEIGHT = 752, 480

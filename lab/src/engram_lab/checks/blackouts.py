@@ -19,14 +19,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import FrameStatus
-from engram.geometry import SE3
+from engram.frontend.frame import FrameStatus
+from engram.geometry.se3 import SE3
 from engram.graph.model import Node
-from engram.localiser import Localisation, LocalisationStatus, Position
-from engram.odometry import OdometryStatus, OdometryStep, OutsideMotion
-from engram.robot import RobotOptions, Settings, map_drive, open_map, robot_on
-from engram.sequences import FrameLog, LoggedFrame, open_drive
-from engram.sequences.trajectories import Trajectory
+from engram.localiser.localisation import Localisation, LocalisationStatus, Position
+from engram.maps.map import open_map
+from engram.odometry.outside import OutsideMotion
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import robot_on
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.motion import Trajectory
+from engram.sequences.opening import open_drive
+from engram.sequences.sequence import LoggedFrame
 from engram_lab.truth import read_truth
 from engram_lab.wheels import BIAS_RAD_S, measured
 

@@ -20,11 +20,15 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.maps import Map, copy_map
+from engram.maps.map import Map
+from engram.maps.map_files import copy_map
 from engram.measures import Drive, route_not_localised
-from engram.robot import RobotOptions, Settings, map_drive, measure, open_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import measure
+from engram.sequences.opening import open_drive
 from engram_lab.intervals import Array, Interval, Resamples
-from engram_lab.town import Campaign, campaign_named
+from engram_lab.town.campaigns import Campaign, campaign_named
 from engram_lab.town.simulating import campaigns_folder, simulate
 from engram_lab.trial_towns import longer_trial_town
 

@@ -18,13 +18,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from engram.frontend import BRIEF, DescriptorKind
-from engram.geometry import StereoCamera
+from engram.frontend.frame import BRIEF, DescriptorKind
+from engram.geometry.cameras import StereoCamera
 from engram.monitor import QUIET
-from engram.odometry import Odometry
-from engram.robot import Front, Robot, Settings
+from engram.odometry.odometry import Odometry
+from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
-from engram.sequences import LoggedFrame
+from engram.robot.robot import Robot
+from engram.robot.settings import Settings
+from engram.sequences.sequence import LoggedFrame
 from engram_lab.misplaced import Street
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.trial_towns import HELD_OUT_TOWNS, all_streets, light_of

@@ -28,16 +28,20 @@ from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from engram.agent import Agent, AgentSettings, enrol
-from engram.agent.sending import QUEUED, SENT
-from engram.centre.access.enrolment import new_code
+from engram.agent.agent import Agent
+from engram.agent.link import enrol
+from engram.agent.outbox import QUEUED, SENT
+from engram.agent.state import AgentSettings
+from engram.centre.access import new_code
+from engram.centre.database import first_broken
 from engram.centre.handins import HandIns
 from engram.centre.service import Centre
 from engram.centre.serving import Listening, run_worker, serve
-from engram.centre.store.audit import first_broken
 from engram.errors import EngramError
-from engram.fleet.merge import MergeOptions, merge
-from engram.maps import Map, check_file, copy_map
+from engram.fleet.merge.merging import merge
+from engram.fleet.merge.settings import MergeOptions
+from engram.maps.map import Map
+from engram.maps.map_files import check_file, copy_map
 from engram.processes import end_with_parent
 from engram_lab.checks.centre_load import drive, made_centre
 from engram_lab.programs import Figure, command_line, report
@@ -48,7 +52,7 @@ _NODES = 4
 _LOADED = [
     __name__,
     "uvicorn.protocols.http.auto",
-    "engram.centre.api.app",
+    "engram.centre.app",
     "engram.fleet.download",
 ]
 _LOOK_S = 0.05

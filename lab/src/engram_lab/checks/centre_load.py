@@ -30,12 +30,12 @@ from typing import Any
 import httpx
 import numpy as np
 
-from engram.agent import Agent, enrol
-from engram.agent.link import new_client
-from engram.centre.access.enrolment import new_code
+from engram.agent.agent import Agent
+from engram.agent.link import enrol, new_client
+from engram.centre.access import new_code
 from engram.centre.service import Centre, MapPolicy
-from engram.fleet.merge import MergeOptions
-from engram.maps import open_map
+from engram.fleet.merge.settings import MergeOptions
+from engram.maps.map import open_map
 from engram_lab.checks.merge_scaling import SESSION_NODES, write_map, write_session
 from engram_lab.programs import Figure, command_line, report
 

@@ -16,16 +16,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from engram.agent import Agent, AgentSettings, enrol
-from engram.agent.link import new_client
-from engram.agent.sending import QUEUED
-from engram.centre.access.enrolment import new_code
-from engram.graph.attempts import Attempts
+from engram.agent.agent import Agent
+from engram.agent.link import enrol, new_client
+from engram.agent.outbox import QUEUED
+from engram.agent.state import AgentSettings
+from engram.centre.access import new_code
 from engram.graph.model import Attempt, PathEntry, PathEntryKind, path_id
-from engram.maps import Map, RevisionWriter, open_map
+from engram.graph.paths import Attempts
+from engram.maps.map import Map, open_map
+from engram.maps.writer import RevisionWriter
 from engram_lab.checks.centre_load import made_centre, served
 from engram_lab.checks.merge_scaling import write_session
-from engram_lab.fleet_day.proxy import cutting
+from engram_lab.fleet_day.day import cutting
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.synthetic_places import CAMERA, DESCRIPTOR, FRONTEND, drive_of
 

@@ -22,21 +22,23 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.cli.progress import Bars
-from engram.frontend import FrameStatus
-from engram.geometry import SE3
+from engram.cli.screen import Bars
+from engram.frontend.frame import FrameStatus
+from engram.geometry.se3 import SE3
 from engram.graph.model import NodeId, node_id
-from engram.localiser import AcceptanceConfig, Budget, FrameMatcher, Relocaliser
-from engram.maps import Map, open_map
+from engram.localiser.acceptance import AcceptanceConfig
+from engram.localiser.attempts import FrameMatcher
+from engram.localiser.localisation import Budget
+from engram.localiser.relocalisation import Relocaliser
+from engram.maps.map import Map, open_map
 from engram.monitor import Monitor
-from engram.odometry import GapFiller, OdometryStatus, OdometryStep
-from engram.robot import RobotOptions, Settings
+from engram.odometry.motion import GapFiller
+from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.robot.localisers import localiser_in, relocaliser_in
+from engram.robot.settings import RobotOptions, Settings
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.studies.building import build_map, true_nodes
-from engram_lab.studies.drives import EvaluatedDrive, open_campaign
-from engram_lab.studies.folds import split
-from engram_lab.studies.starting import TrueNodes
+from engram_lab.studies.drives import EvaluatedDrive, TrueNodes, open_campaign, split
 from engram_lab.town.simulating import campaigns_folder
 
 FOLDS = 5

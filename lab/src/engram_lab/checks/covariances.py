@@ -19,12 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.model import NodeId, node_id
-from engram.localiser import Position
+from engram.localiser.localisation import Position
 from engram.monitor import QUIET
-from engram.odometry import GapFiller
-from engram.robot import Settings
+from engram.odometry.motion import GapFiller
+from engram.robot.settings import Settings
 from engram_lab.accuracy import LEVELS, squared
 from engram_lab.misplaced import Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report

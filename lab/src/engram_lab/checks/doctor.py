@@ -25,12 +25,14 @@ import numpy as np
 from platformdirs import user_cache_path
 
 import engram
-from engram.doctor import Diagnosis, Facts, Severity
-from engram.frontend import StereoPair
+from engram.doctor.examination import Facts
+from engram.doctor.table import Diagnosis, Severity
+from engram.frontend.frame import StereoPair
 from engram.frontend.frontend import SMALLEST_SIDE_PX
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.model import Clock
-from engram.robot import Front, Settings
+from engram.robot.front import Front
+from engram.robot.settings import Settings
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.studies.faults.clips import DOCTORED
 from engram_lab.studies.faults.injected import (

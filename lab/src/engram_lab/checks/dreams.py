@@ -15,13 +15,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from engram.files import draft_folder
-from engram.fleet.dream import DreamOptions, dream
-from engram.fleet.dream.judging import gain, localised_in
-from engram.fleet.merge import merge
-from engram.maps import Map, copy_map, publish_map
+from engram.fleet.dream import DreamOptions, dream, gain, localised_in
+from engram.fleet.merge.merging import merge
+from engram.maps.map import Map
+from engram.maps.map_files import copy_map, publish_map
 from engram.measures import Drive, route_not_localised
 from engram.monitor import QUIET
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 from engram_lab.town.simulating import campaigns_folder, simulate
 from engram_lab.trial_towns import longer_trial_town
 

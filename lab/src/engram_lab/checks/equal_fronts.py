@@ -22,8 +22,8 @@ import numpy as np
 
 from engram.cli.settings import read_settings
 from engram.graph.model import EdgeKind
-from engram.maps import open_map
-from engram.robot import Settings
+from engram.maps.map import open_map
+from engram.robot.settings import Settings
 from engram_lab.misplaced import FALSE_M, SURE, Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.studies.building import GENEROUS, build_map, true_nodes

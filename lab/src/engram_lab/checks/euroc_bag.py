@@ -23,14 +23,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.calibration import Cameras
-from engram.geometry import SE3
-from engram.maps import open_map
+from engram.calibration.cameras import Cameras
+from engram.geometry.se3 import SE3
+from engram.maps.map import open_map
 from engram.monitor import QUIET
-from engram.robot import RobotOptions, Settings, map_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_on
-from engram.sequences import open_drive
-from engram.sequences.image_sequence import ImageSequence
+from engram.sequences.layouts import ImageSequence
+from engram.sequences.opening import open_drive
 from engram_lab.checks.accuracy import NEAR_M, error_of, frames_of, match
 
 _TOPICS = ("/cam0/image_raw", "/cam1/image_raw")

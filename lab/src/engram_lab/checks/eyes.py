@@ -20,14 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.cli.progress import Bars
-from engram.frontend import Frame, Frontend, FrontendConfig, Match, feature_kind, match_frames
-from engram.frontend.features import NET, FeatureKind, detect_corners, fitted_matcher
-from engram.frontend.frame import BRIEF
-from engram.frontend.matching import MatcherConfig
-from engram.geometry import SE3
+from engram.cli.screen import Bars
+from engram.frontend.features import NET, FeatureKind, detect_corners, feature_kind, fitted_matcher
+from engram.frontend.frame import BRIEF, Frame
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.frontend.matching import Match, MatcherConfig, match_frames
+from engram.geometry.se3 import SE3
 from engram.monitor import Monitor, write_whole
-from engram.places import FabMap, PlaceRecogniser, Signatures, default_vocabulary
+from engram.places.recognisers import FabMap, PlaceRecogniser, Signatures
+from engram.places.vocabulary import default_vocabulary
 from engram_lab.checks import eyes_real
 from engram_lab.eyes import Scene, judged_scene, training_scene
 from engram_lab.programs import command_line

@@ -12,9 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.frontend import Frame, Frontend, Match, feature_kind
-from engram.geometry import SE3
-from engram.odometry import Odometry, OdometryConfig
+from engram.frontend.features import feature_kind
+from engram.frontend.frame import Frame
+from engram.frontend.frontend import Frontend
+from engram.frontend.matching import Match
+from engram.geometry.se3 import SE3
+from engram.odometry.odometry import Odometry, OdometryConfig
 from engram_lab.checks.accuracy import segment_errors
 from engram_lab.eyes import clip
 

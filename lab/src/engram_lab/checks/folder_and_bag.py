@@ -16,13 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.calibration import Cameras
+from engram.calibration.cameras import Cameras
 from engram.calibration.toml import calibration_toml
-from engram.frontend import StereoPair
-from engram.maps import open_map
+from engram.frontend.frame import StereoPair
+from engram.maps.map import open_map
 from engram.monitor import QUIET
-from engram.robot import RobotOptions, Settings, map_drive, open_drive, robot_on
-from engram.robot.session import DriveSequence
+from engram.robot.localisers import DriveSequence
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import robot_on
+from engram.sequences.opening import open_drive
 from engram_lab.checks.euroc_bag import write_bag
 
 _LEAST_SHARE = 48 / 51

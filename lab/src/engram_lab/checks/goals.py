@@ -27,19 +27,21 @@ from typing import TypeAlias
 
 import numpy as np
 
-from engram.fleet.merge import merge
-from engram.geometry import SE3
-from engram.graph.marks import Goal
-from engram.graph.model import SessionId
+from engram.fleet.merge.merging import merge
+from engram.geometry.se3 import SE3
+from engram.graph.model import Goal, SessionId
 from engram.graph.placing import fit_level
-from engram.maps import FramePose, Map
+from engram.maps.map import Map
+from engram.maps.map_frame import FramePose
 from engram.monitor import write_whole
-from engram.robot import RobotOptions, Settings, map_drive, open_drive, session_of_drive
-from engram.sequences import FrameLog
+from engram.robot.localisers import session_of_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.opening import open_drive
 from engram_lab.programs import Figure, command_line, report
-from engram_lab.studies.drives import EvaluatedDrive, Truth, campaign_logs, drives_of
-from engram_lab.studies.starting import TrueNodes
-from engram_lab.town import Campaign, campaign_named
+from engram_lab.studies.drives import EvaluatedDrive, TrueNodes, Truth, campaign_logs, drives_of
+from engram_lab.town.campaigns import Campaign, campaign_named
 from engram_lab.town.simulating import campaigns_folder
 from engram_lab.trial_towns import longer_trial_town
 

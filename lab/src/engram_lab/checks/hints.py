@@ -18,10 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.frontend import BRIEF, DescriptorKind
-from engram.localiser import METHOD_VERSION, Budget
+from engram.frontend.frame import BRIEF, DescriptorKind
+from engram.localiser.localisation import Budget
+from engram.localiser.settings import METHOD_VERSION
 from engram.monitor import QUIET
-from engram.robot import Settings
+from engram.robot.settings import Settings
 from engram_lab.misplaced import FALSE_M, FALSE_RAD, Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.trial_towns import HELD_OUT_TOWNS, streets, towns_folder

@@ -23,8 +23,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
     # Here, as each process of admission loads this module anew.
-    from engram_lab.mutations.samples import make_samples
-    from engram_lab.mutations.uploads import Site
+    from engram_lab.mutations.case import make_samples
+    from engram_lab.mutations.handins import Site
 
     with tempfile.TemporaryDirectory() as folder:
         samples = make_samples(Path(folder))

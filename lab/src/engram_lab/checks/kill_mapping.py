@@ -20,7 +20,8 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from engram.maps import Map, check_file
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 from engram_lab.programs import command_line
 
 # The child tells when a checkpoint is about to be committed and when it is done.
@@ -30,8 +31,9 @@ from pathlib import Path
 from sqlalchemy import event
 from sqlalchemy.engine import Engine
 from engram.monitor import Advancing
-from engram.robot import map_drive, open_drive
-from engram.maps import RevisionWriter
+from engram.robot.mapping import map_drive
+from engram.sequences.opening import open_drive
+from engram.maps.writer import RevisionWriter
 from engram_lab.there_and_back import ThereAndBack
 
 @event.listens_for(Engine, "commit")

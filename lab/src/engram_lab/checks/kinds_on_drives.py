@@ -14,10 +14,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from engram.frontend import DescriptorKind
-from engram.maps import Map
+from engram.frontend.frame import DescriptorKind
+from engram.maps.map import Map
 from engram.measures import route_not_localised
-from engram.robot import RobotOptions, Settings, map_drive, measure
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import measure
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.studies.faults.clips import JUDGING, SETTING, ClipDrive, missing
 

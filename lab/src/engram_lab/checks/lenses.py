@@ -16,9 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.maps import Map
+from engram.maps.map import Map
 from engram.measures import route_not_localised
-from engram.robot import RobotOptions, Settings, map_drive, measure, open_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import measure
+from engram.sequences.opening import open_drive
 from engram_lab.intervals import Array, Resamples
 
 BUDGETS = {"one attempt": (1, 1), "four": (2, 2)}

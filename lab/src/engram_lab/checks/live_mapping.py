@@ -17,12 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.maps import open_map
+from engram.maps.map import open_map
 from engram.monitor import QUIET
-from engram.robot import RobotOptions, Settings, open_drive
 from engram.robot.live import Owner
+from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_in
-from engram.sequences import FrameLog
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.opening import open_drive
 from engram_lab.there_and_back import ThereAndBack
 
 

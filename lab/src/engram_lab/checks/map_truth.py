@@ -21,17 +21,18 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.basin import DEFAULT_RADIUS_M
 from engram.graph.model import EdgeKind
 from engram.graph.neighbourhood import Search
-from engram.maps import Map
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
+from engram.maps.map import Map
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 from engram_lab.programs import command_line, numbers
-from engram_lab.studies.drives import EvaluatedDrive, drives_of
-from engram_lab.studies.edge_truth import EdgeError, edge_errors
-from engram_lab.studies.starting import TrueNodes
-from engram_lab.town import Size, campaign_named
+from engram_lab.studies.building import EdgeError, edge_errors
+from engram_lab.studies.drives import EvaluatedDrive, TrueNodes, drives_of
+from engram_lab.town.campaigns import Size, campaign_named
 from engram_lab.town.simulating import campaign_folder, campaigns_folder
 from engram_lab.trial_towns import trial_town
 

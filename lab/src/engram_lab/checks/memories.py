@@ -18,18 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.fleet.merge import merge
-from engram.maps import Map, copy_map
+from engram.fleet.merge.merging import merge
+from engram.maps.map import Map
+from engram.maps.map_files import copy_map
 from engram.measures import route_not_localised
-from engram.robot import (
-    RobotOptions,
-    Settings,
-    load_settings,
-    map_drive,
-    measured,
-    open_drive,
-    robot_on,
-)
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings, load_settings
+from engram.robot.starting import measured, robot_on
+from engram.sequences.opening import open_drive
 from engram_lab.intervals import Array, Interval, Resamples
 from engram_lab.town.simulating import campaigns_folder, simulate
 from engram_lab.trial_towns import longer_trial_town

@@ -37,10 +37,12 @@ from typing import TypeVar
 import numpy as np
 
 from engram.errors import InputError
-from engram.fleet.download import DownloadOptions, download
-from engram.fleet.merge import MergeOptions, MergeReport, merge
-from engram.geometry import SE3
-from engram.graph.attempts import Attempts
+from engram.fleet.download.downloading import download
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.merge.merging import merge
+from engram.fleet.merge.report import MergeReport
+from engram.fleet.merge.settings import MergeOptions
+from engram.geometry.se3 import SE3
 from engram.graph.model import (
     Attempt,
     Clock,
@@ -54,7 +56,9 @@ from engram.graph.model import (
     SessionId,
     path_id,
 )
-from engram.maps import Map, check_file
+from engram.graph.paths import Attempts
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 from engram_lab.programs import command_line
 from engram_lab.synthetic_places import (
     CAMERA,

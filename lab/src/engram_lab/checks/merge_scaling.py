@@ -24,10 +24,13 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.fleet.merge import MergeOptions, merge
-from engram.geometry import SE3
+from engram.fleet.merge.merging import merge
+from engram.fleet.merge.settings import MergeOptions
+from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, path_id
-from engram.maps import Map, RevisionWriter, copy_map
+from engram.maps.map import Map
+from engram.maps.map_files import copy_map
+from engram.maps.writer import RevisionWriter
 from engram_lab.programs import command_line
 from engram_lab.synthetic_places import (
     CAMERA,

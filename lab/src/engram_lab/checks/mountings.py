@@ -16,14 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.frontend import StereoPair
-from engram.geometry import SE3, StereoCamera
+from engram.frontend.frame import StereoPair
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 from engram.measures import route_not_localised
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
-from engram.robot.recording import extract_log
+from engram.robot.mapping import extract_log, map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 from engram_lab.checks.both_directions import localised
-from engram_lab.town import Campaign
-from engram_lab.town.sequence import SimulatedSequence
+from engram_lab.town.campaigns import Campaign
+from engram_lab.town.session import SimulatedSequence
 from engram_lab.town.simulating import campaign_folder, campaigns_folder, simulate
 from engram_lab.trial_towns import longer_trial_town
 

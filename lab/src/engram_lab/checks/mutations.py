@@ -27,10 +27,9 @@ from pathlib import Path
 import cv2
 
 from engram_lab.mutations import bytewise, definitions, handins, rowwise, texts
-from engram_lab.mutations.case import Case, Change, Subject
+from engram_lab.mutations.case import Case, Change, Samples, Subject, make_samples
 from engram_lab.mutations.forks import OF_TEXTS, Outcome, Tell, Trial, tried
 from engram_lab.mutations.reading import Held, held, read
-from engram_lab.mutations.samples import Samples, make_samples
 from engram_lab.programs import Figure, command_line, report
 
 TEXTS: dict[str, Change] = {

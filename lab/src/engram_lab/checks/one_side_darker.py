@@ -20,17 +20,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import Frontend, FrontendConfig, Landmarks, StereoPair
-from engram.geometry import StereoCamera
+from engram.frontend.frame import Landmarks, StereoPair
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.geometry.cameras import StereoCamera
 from engram.graph.model import Clock
-from engram.localiser import LocalisationStatus
-from engram.maps import Map
-from engram.robot import Settings, localise_drive, map_drive
+from engram.localiser.localisation import LocalisationStatus
+from engram.maps.map import Map
+from engram.robot.mapping import map_drive
+from engram.robot.settings import Settings
+from engram.robot.starting import localise_drive
 from engram.sequences.sequence import SequenceInfo
 from engram_lab.checks.accuracy import EUROC, KITTI_06
 from engram_lab.eyes import clip
 from engram_lab.programs import Figure, command_line, report
-from engram_lab.town import SimulatedDrive, campaign_named
+from engram_lab.town.campaigns import campaign_named
+from engram_lab.town.session import SimulatedDrive
 
 Grey = NDArray[np.float32]
 Change = Callable[[Grey, int], Grey]

@@ -24,10 +24,9 @@ from pathlib import Path
 import numpy as np
 
 from engram import _core
-from engram.frontend import FrontendConfig
-from engram.frontend.quantisation import _SIGMA_BORDERS_PX, SIGMA_TABLE_PX
-from engram.odometry import OdometryConfig
-from engram.odometry.odometry import _settings
+from engram.frontend.blobs import _SIGMA_BORDERS_PX, SIGMA_TABLE_PX
+from engram.frontend.frontend import FrontendConfig
+from engram.odometry.odometry import OdometryConfig, _settings
 from engram_lab.bench.data import load_bench_data
 from engram_lab.programs import command_line
 

@@ -65,7 +65,7 @@ FAULTS = {
         "test_nodes_of_a_parallel_build_are_those_after_the_last_merge",
     ),
     "own nodes are left out of united": Fault(
-        "lab/src/engram_lab/studies/fleet/trials.py",
+        "lab/src/engram_lab/studies/fleet/steps.py",
         "return mine + sum(",
         "return sum(",
         "test_united_counts_own_nodes_and_what_was_sent_once",

@@ -12,13 +12,14 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.cli.progress import Bars
-from engram.frontend import Frontend, FrontendConfig, Landmarks
-from engram.geometry import SE3, StereoCamera
-from engram_lab.eyes import Scene, judged_scene
-from engram_lab.eyes.scenes import JUDGED
+from engram.cli.screen import Bars
+from engram.frontend.frame import Landmarks
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+from engram_lab.eyes import JUDGED, Scene, judged_scene
 from engram_lab.programs import Figure, command_line, report
-from engram_lab.town.visits import Places
+from engram_lab.town.rendering import Places
 
 VISITS = ("rain", "rain again", "rain at night", "fog", "morning")
 _WITHIN_PX, _AROUND_PX = 1.0, 2

@@ -26,21 +26,19 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from engram.frontend import BRIEF
+from engram.frontend.frame import BRIEF
 from engram.frontend.matching import MatcherConfig, match_frames, pair_seed
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Edge, EdgeKind
-from engram.localiser import AcceptanceConfig
-from engram.maps import Map
-from engram.maps.laying_out import graph_of
-from engram.places import BagOfWords
+from engram.localiser.acceptance import AcceptanceConfig
+from engram.maps.map import Map
+from engram.maps.map_frame import graph_of
+from engram.places.recognisers import BagOfWords
 from engram.places.words import vocabulary_or_default, words_of
-from engram.repair import RepairConfig, find_wrong_edges
-from engram.repair.surroundings import is_measured
+from engram.repair.finding import RepairConfig, find_wrong_edges, is_measured
 from engram_lab.programs import Figure, command_line, report
-from engram_lab.studies.drives import campaign_logs, drives_of
-from engram_lab.studies.starting import TrueNodes
-from engram_lab.town import campaign_named
+from engram_lab.studies.drives import TrueNodes, campaign_logs, drives_of
+from engram_lab.town.campaigns import campaign_named
 from engram_lab.town.simulating import campaigns_folder
 
 # A planted match is wrong by more than this; places nearer than `_APART_M` are one place.

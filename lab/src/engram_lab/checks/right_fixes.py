@@ -17,10 +17,11 @@ from dataclasses import dataclass, replace
 
 from engram.cli.settings import read_settings
 from engram.errors import ConfigError
-from engram.frontend import BRIEF, DescriptorKind
-from engram.localiser import LocaliserConfig, Rule
+from engram.frontend.frame import BRIEF, DescriptorKind
+from engram.localiser.acceptance import Rule
+from engram.localiser.settings import LocaliserConfig
 from engram.monitor import QUIET
-from engram.robot import Settings
+from engram.robot.settings import Settings
 from engram_lab.misplaced import Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.studies.in_force import check_used

@@ -24,9 +24,9 @@ from pathlib import Path
 import numpy as np
 
 from engram import _core
-from engram.frontend import StereoPair
-from engram.maps import open_map
-from engram.robot import Settings
+from engram.frontend.frame import StereoPair
+from engram.maps.map import open_map
+from engram.robot.settings import Settings
 from engram_lab.bench.data import load_bench_data
 from engram_lab.programs import Figure, command_line, report
 

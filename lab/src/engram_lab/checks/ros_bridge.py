@@ -27,15 +27,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import StereoPair
-from engram.geometry import SE3, StereoCamera
+from engram.frontend.frame import StereoPair
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 from engram.graph.model import Clock
-from engram.maps import open_map
-from engram.robot import map_drive
-from engram.sequences import SequenceInfo
+from engram.maps.map import open_map
+from engram.robot.mapping import map_drive
+from engram.sequences.sequence import SequenceInfo
 from engram_lab.town.campaigns import campaign_named
-from engram_lab.town.drive import Pose
-from engram_lab.town.robots import Robot
+from engram_lab.town.drive import Pose, Robot
 from engram_lab.town.session import SimulatedDrive
 
 _BRIDGE = Path(__file__).parents[4] / "ros" / "engram_bridge"

@@ -18,12 +18,16 @@ from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
-from engram.fleet.merge import MergeOptions, merge
-from engram.frontend import BRIEF, DescriptorKind
-from engram.localiser import Localisation
-from engram.mapper import MapperConfig
-from engram.maps import Map
-from engram.robot import Settings, map_drive, open_drive, robot_on
+from engram.fleet.merge.merging import merge
+from engram.fleet.merge.settings import MergeOptions
+from engram.frontend.frame import BRIEF, DescriptorKind
+from engram.localiser.localisation import Localisation
+from engram.mapper.mapper import MapperConfig
+from engram.maps.map import Map
+from engram.robot.mapping import map_drive
+from engram.robot.settings import Settings
+from engram.robot.starting import robot_on
+from engram.sequences.opening import open_drive
 from engram_lab.misplaced import FALSE_M, FALSE_RAD
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.studies.drives import EvaluatedDrive, Truth

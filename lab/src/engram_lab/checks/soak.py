@@ -33,16 +33,18 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.frontend import Frame, FrameStatus, StereoPair
-from engram.frontend.quantisation import quantised_landmarks
-from engram.geometry import SE3
+from engram.frontend.blobs import quantised_landmarks
+from engram.frontend.frame import Frame, FrameStatus, StereoPair
+from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind, Node, NodeId
-from engram.localiser import Position
-from engram.maps import Map, open_map
-from engram.odometry import OdometryStatus, OdometryStep
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
+from engram.localiser.localisation import Position
+from engram.maps.map import Map, open_map
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.robot.mapping import map_drive
 from engram.robot.robot import Robot
-from engram.sequences import LoggedFrame
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
+from engram.sequences.sequence import LoggedFrame
 from engram_lab.bench.data import load_bench_data
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.synthetic_places import (

@@ -17,9 +17,10 @@ from pathlib import Path
 import numpy as np
 
 import engram
-from engram.frontend import StereoPair
-from engram.geometry import SE3
-from engram.sequences import ImageSequence, StereoSequence
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
+from engram.sequences.layouts import ImageSequence
+from engram.sequences.sequence import StereoSequence
 from engram_lab.programs import Figure, command_line, report
 
 KITTI_06 = "kitti_odometry/sequences/06"

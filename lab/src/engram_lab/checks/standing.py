@@ -23,11 +23,17 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.doctor import Severity
-from engram.frontend import Frontend, StereoPair
-from engram.geometry import SE3
-from engram.odometry import Odometry, OutsideMotion
-from engram.robot import Front, RobotOptions, Settings, map_drive, open_drive, open_map
+from engram.doctor.table import Severity
+from engram.frontend.frame import StereoPair
+from engram.frontend.frontend import Frontend
+from engram.geometry.se3 import SE3
+from engram.maps.map import open_map
+from engram.odometry.odometry import Odometry
+from engram.odometry.outside import OutsideMotion
+from engram.robot.front import Front
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.studies.faults.clips import Clip, ClipDrive, ClipPlan
@@ -39,7 +45,7 @@ from engram_lab.studies.faults.injected import (
     on_both,
     undisturbed,
 )
-from engram_lab.studies.faults.real import RealPlan
+from engram_lab.studies.faults.study import RealPlan
 
 SHARES, CONTRASTS = (0.1, 0.2, 0.35, 0.6), (0.25, 0.5, 1.0)
 SIDES = ("bottom", "top", "left", "right")

@@ -25,12 +25,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import Frontend
-from engram.geometry import SE3
-from engram.sequences import FrameLog
+from engram.frontend.frontend import Frontend
+from engram.geometry.se3 import SE3
+from engram.sequences.framelog.reader import FrameLog
 from engram_lab.programs import command_line
-from engram_lab.town import Campaign, SimulatedDrive, campaign_named
+from engram_lab.town.campaigns import Campaign, campaign_named
 from engram_lab.town.conditions import Conditions
+from engram_lab.town.session import SimulatedDrive
 from engram_lab.town.simulating import campaign_folder, campaigns_folder
 from engram_lab.truth import read_truth
 

@@ -23,16 +23,17 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
-from engram.cli.progress import Bars
-from engram.frontend import BRIEF, DescriptorKind
-from engram.localiser import METHOD_VERSION, Budget
-from engram.mapper import MapperConfig
+from engram.cli.screen import Bars
+from engram.frontend.frame import BRIEF, DescriptorKind
+from engram.localiser.localisation import Budget
+from engram.localiser.settings import METHOD_VERSION
+from engram.mapper.mapper import MapperConfig
 from engram.monitor import Monitor
-from engram.robot import Settings
+from engram.robot.settings import Settings
 from engram_lab.misplaced import Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.studies.drives import EvaluatedDrive, campaign_logs, drives_of
-from engram_lab.town import campaign_named
+from engram_lab.town.campaigns import campaign_named
 from engram_lab.town.simulating import campaign_folder, campaigns_folder, simulate
 from engram_lab.trial_towns import towns_folder
 

@@ -21,19 +21,22 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.frontend import StereoPair
-from engram.geometry import SE3
-from engram.maps import open_map
-from engram.odometry import GapFiller, Motion, OdometryStatus, OdometryStep, OutsideMotion
-from engram.robot import RobotOptions, Settings, map_drive
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
+from engram.maps.map import open_map
+from engram.odometry.motion import GapFiller, Motion
+from engram.odometry.outside import OutsideMotion
+from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.robot.front import Front
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
 from engram_lab.misplaced import FALSE_M, FALSE_RAD, Kind, Street, Try
 from engram_lab.programs import Figure, command_line, numbers, report
-from engram_lab.studies.edge_truth import edge_errors
+from engram_lab.studies.building import edge_errors
 from engram_lab.studies.faults.clips import Clip, ClipDrive
 from engram_lab.studies.faults.injected import brightened, with_car
-from engram_lab.studies.faults.places import Place, mapped_by
-from engram_lab.studies.faults.real import DRIVES, real_plans
+from engram_lab.studies.faults.staging import Place, mapped_by
+from engram_lab.studies.faults.study import DRIVES, real_plans
 from engram_lab.trial_towns import HELD_OUT_TOWNS, all_streets, light_of
 from engram_lab.wheels import Wheels, measured
 

@@ -18,10 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.frontend import Frame, Frontend, FrontendConfig, Landmarks
-from engram.geometry import SE3
-from engram.odometry import Odometry, OdometryConfig, WindowConfig
-from engram.sequences import FrameLog
+from engram.frontend.frame import Frame, Landmarks
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.geometry.se3 import SE3
+from engram.odometry.odometry import Odometry, OdometryConfig, WindowConfig
+from engram.sequences.framelog.reader import FrameLog
 from engram_lab.bench.data import load_bench_data
 from engram_lab.checks.accuracy import KITTI_06_TRUTH, kitti_truth, segment_errors
 from engram_lab.checks.town_accuracy import lap_drift

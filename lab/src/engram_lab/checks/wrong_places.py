@@ -14,13 +14,12 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from engram.localiser import METHOD_VERSION
-from engram.robot import Settings
-from engram_lab.misplaced import Street
+from engram.localiser.settings import METHOD_VERSION
+from engram.robot.settings import Settings
+from engram_lab.misplaced import Street, WrongPlaces
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.town.simulating import campaigns_folder
 from engram_lab.trial_towns import HELD_OUT_TOWNS, town_pairs
-from engram_lab.wrong_places import WrongPlaces
 
 # Matches of so many inliers are wrong, and would be fixes near a prediction by the published rule.
 _MANY = 20

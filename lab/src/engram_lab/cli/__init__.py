@@ -2,10 +2,9 @@
 
 import typer
 
-from engram_lab.cli.fleet_day import fleet_day
 from engram_lab.cli.maps import places, relocalise, try_
 from engram_lab.cli.studies import evaluate
-from engram_lab.cli.town import bench, demo, simulate
+from engram_lab.cli.town import bench, demo, fleet_day, simulate
 
 lab = typer.Typer(
     name="lab",

@@ -50,10 +50,10 @@ def relocalise(
       engram lab relocalise town.engram drives/tuesday
       engram lab relocalise town.engram drives/tuesday --frames 0:1000:10 --json
     """
-    from engram.cli.progress import Bars
+    from engram.cli.screen import Bars
     from engram.cli.settings import read_settings
-    from engram.localiser import Budget
-    from engram.robot import RobotOptions
+    from engram.localiser.localisation import Budget
+    from engram.robot.settings import RobotOptions
     from engram_lab.relocalising import relocalise_drive, summarise_cold_starts
 
     sequence, given = drive.open(path), read_settings(config)
@@ -102,7 +102,7 @@ def places(
       engram lab places town.engram
       engram lab places town.engram --top 50 --picture confusion.png
     """
-    from engram.cli.progress import Bars
+    from engram.cli.screen import Bars
     from engram_lab.lookalikes import find_lookalikes, write_confusion_picture
 
     confusion = find_lookalikes(map_path, at, Bars())
@@ -167,9 +167,11 @@ def try_(
       engram lab try fleet.engram monday.framelog --select tod --depart 9:30
       engram lab try fleet.engram monday.framelog tuesday.framelog --select budget --budget 25%
     """
-    from engram.cli.progress import Bars
-    from engram.fleet.download import budget_from_text, hour_from_text
-    from engram.robot import RobotOptions, open_drive, session_of_drive
+    from engram.cli.screen import Bars
+    from engram.fleet.download.mission import budget_from_text, hour_from_text
+    from engram.robot.localisers import session_of_drive
+    from engram.robot.settings import RobotOptions
+    from engram.sequences.opening import open_drive
     from engram_lab.trial import (
         LeftOut,
         TrialSummary,

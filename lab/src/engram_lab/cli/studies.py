@@ -14,11 +14,26 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from engram.cli import options
-from engram_lab.cli.lists import numbers
+from engram.errors import ConfigError
 
 if TYPE_CHECKING:
-    from engram.robot import Settings
-    from engram_lab.studies import DriveSet
+    from engram.robot.settings import Settings
+    from engram_lab.studies.drives import DriveSet
+
+
+def numbers(text: str, option: str) -> tuple[int, ...]:
+    """Whole numbers joined by commas, in their order.
+
+    Raises:
+        ConfigError: one is not a whole number.
+    """
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(
+            f"{option} {text!r}: expected whole numbers joined by commas, such as 0,3"
+        ) from None
+
 
 evaluate = typer.Typer(
     name="evaluate",
@@ -81,8 +96,8 @@ class _Study:
     def drive_sets(self, settings: Settings) -> list[DriveSet]:
         """Each name of a campaign is one; all frame logs together are one."""
         from engram.errors import ConfigError
-        from engram_lab.studies import DriveSet, drives_of, open_campaign
-        from engram_lab.town import Size
+        from engram_lab.studies.drives import DriveSet, drives_of, open_campaign
+        from engram_lab.town.campaigns import Size
         from engram_lab.town.simulating import campaigns_folder
 
         names = [one for one in self.drives if _names_campaign(one)]
@@ -205,18 +220,12 @@ def ranking(
       engram lab evaluate ranking begbroke --policies distance,path,recall --only-folds 0
       engram lab evaluate ranking monday.framelog tuesday.framelog … --out results/mine
     """
-    from engram.cli.progress import Bars
+    from engram.cli.screen import Bars
     from engram.cli.settings import read_settings
     from engram_lab.policies import STUDIED
-    from engram_lab.studies import (
-        DEFAULT_LANES,
-        UNLIMITED,
-        RankingOptions,
-        forget,
-        make_plan,
-        run,
-        write_report,
-    )
+    from engram_lab.studies.configurations import DEFAULT_LANES, UNLIMITED
+    from engram_lab.studies.ranking_report import write_report
+    from engram_lab.studies.running import RankingOptions, forget, make_plan, run
 
     started, settings = time.perf_counter(), read_settings(study.config).for_descriptor(None)
     drive = settings.drive
@@ -305,15 +314,11 @@ def fleet(
       engram lab evaluate fleet begbroke24h --config gadd2016
       engram lab evaluate fleet begbroke24h --report-only
     """
-    from engram.cli.progress import Bars
+    from engram.cli.screen import Bars
     from engram.cli.settings import read_settings
-    from engram_lab.studies.fleet import (
-        FleetOptions,
-        arms_for,
-        make_fleet_plan,
-        run_fleet,
-        write_fleet_report,
-    )
+    from engram_lab.studies.fleet.experiments import run_fleet
+    from engram_lab.studies.fleet.plan import FleetOptions, arms_for, make_fleet_plan
+    from engram_lab.studies.fleet.report import write_fleet_report
 
     started, settings = time.perf_counter(), read_settings(study.config).for_descriptor(None)
     counts = numbers(groups, "--groups")
@@ -338,7 +343,7 @@ def fleet(
 
 def _names_campaign(text: str) -> bool:
     """Whether it is to be a campaign: a known one comes before a folder of the same name."""
-    from engram_lab.town import CAMPAIGNS
+    from engram_lab.town.campaigns import CAMPAIGNS
 
     name = text.partition("@")[0]
     return name in CAMPAIGNS or not (text.endswith(".framelog") or Path(text).exists())
@@ -396,10 +401,9 @@ def faults(
 
     from platformdirs import user_cache_path
 
-    from engram.cli.progress import Bars
-    from engram_lab.studies.faults.page import headline, page
-    from engram_lab.studies.faults.study import run
-    from engram_lab.studies.faults.trials import default_file, read_trials
+    from engram.cli.screen import Bars
+    from engram_lab.studies.faults.staging import default_file, read_trials
+    from engram_lab.studies.faults.study import headline, page, run
 
     file = work or default_file(user_cache_path("engram") / "faults")
     if not report_only:

@@ -1,4 +1,4 @@
-"""`engram demo`, `engram lab simulate` and `engram lab bench`."""
+"""`engram demo`, and `engram lab simulate`, `bench` and `fleet-day`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from engram.cli import options
 from engram.cli.screen import drawing
 
 if TYPE_CHECKING:
-    from engram_lab.demo import DemoReport
+    from engram_lab.demo.story import DemoReport
+    from engram_lab.fleet_day.day import DayReport
 
 
 def demo(
@@ -35,8 +36,8 @@ def demo(
       engram demo
       engram demo --out /tmp/demo --workers 4
     """
-    from engram.cli.progress import Bars
-    from engram_lab.demo import run_demo
+    from engram.cli.screen import Bars
+    from engram_lab.demo.story import run_demo
 
     report = run_demo(out, Bars(), workers)
     if as_json:
@@ -131,11 +132,10 @@ def simulate(
       engram lab simulate hamlet --out campaigns
       engram lab simulate village --images --sessions 0,3 --out campaigns
     """
-    from engram.cli.progress import Bars
+    from engram.cli.screen import Bars
     from engram.cli.settings import read_settings
-    from engram_lab.cli.lists import numbers
-    from engram_lab.town import Size, campaign_named
-    from engram_lab.town.campaigns import estate
+    from engram_lab.cli.studies import numbers
+    from engram_lab.town.campaigns import Size, campaign_named, estate
     from engram_lab.town.simulating import campaigns_folder
     from engram_lab.town.simulating import simulate as render
     from engram_lab.town.streets import Fronts, Unique
@@ -189,7 +189,7 @@ def bench(
         _bench_against(against, only, as_json=as_json)
         return
 
-    from engram_lab.bench import run_bench
+    from engram_lab.bench.runner import run_bench
 
     with Console(file=drawing(sys.stderr)).status("") as status:
         report = run_bench(
@@ -206,8 +206,8 @@ def bench(
 def _bench_against(other: Path, only: str | None, *, as_json: bool) -> None:
     from dataclasses import asdict
 
-    from engram_lab.bench import STAGES
     from engram_lab.bench.against import compare
+    from engram_lab.bench.stages import STAGES
 
     for one in compare(other, only.split(",") if only else list(STAGES)):
         if as_json:
@@ -218,3 +218,80 @@ def _bench_against(other: Path, only: str | None, *, as_json: bool) -> None:
                 f"{one.ratio:.3f} ({one.low:.3f} to {one.high:.3f})",
                 flush=True,
             )
+
+
+def fleet_day(
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for centre, robots and logs.")
+    ] = Path("centre-demo"),
+    workers: Annotated[
+        int, typer.Option("--workers", metavar="N", min=1, help="Processes that render.")
+    ] = 2,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Serve the centre's pages afterwards.")
+    ] = False,
+    as_json: options.Json = False,
+) -> None:
+    """Let three robots share a map through a centre.
+
+    Each drives, hands in over a link that breaks every 200 kB, downloads what its next mission
+    needs, and drives again.
+
+    \b
+    Examples:
+      engram lab fleet-day
+      engram lab fleet-day --out /tmp/day --serve
+    """
+    from engram.cli.screen import Bars
+    from engram_lab.fleet_day.day import run_day
+
+    report = run_day(out, Bars(), workers, lambda line: typer.echo(line, err=True))
+    if as_json:
+        print(json.dumps(report.to_dict()))
+    else:
+        _show_day(report)
+    if serve:
+        from engram.centre.service import Centre
+        from engram.centre.serving import Listening
+        from engram.centre.serving import serve as run
+
+        listening = Listening("127.0.0.1", 8440)
+        typer.echo(f"http://127.0.0.1:8440 with the token {report.token}; Ctrl-C ends it")
+        with Centre(out / "centre") as centre:
+            run(centre, listening)
+
+
+def _show_day(report: DayReport) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("robot", "map", title="Second foray: own map, and a download of the fleet's")
+    for column in ("nodes", "localised", "new nodes", "sent kB", "received kB"):
+        table.add_column(column, justify="right")
+    for one in report.forays:
+        fallen = ", fell back" if one.fell_back else ""
+        rows = (
+            ("own", one.alone, "", ""),
+            (
+                f"{one.download}{fallen}",
+                one.shared,
+                f"{one.sent_bytes / 1e3:.0f}",
+                f"{one.received_bytes / 1e3:.0f}",
+            ),
+        )
+        for name, (whose, drive, sent, received) in zip((one.robot, ""), rows, strict=True):
+            counts = (str(drive.held), f"{drive.localised:.0%}", str(drive.added))
+            table.add_row(name, whose, *counts, sent, received)
+        table.add_section()
+    console = Console(file=drawing(sys.stdout))
+    console.print(table)
+    typer.echo(
+        f"{report.nodes} nodes in {report.revisions} revisions; {report.passed_bytes / 1e6:.1f} MB "
+        f"passed the link, which broke {report.cuts} times; {report.faults} faults in any map"
+    )
+    longest = max(report.stages_s, key=lambda one: report.stages_s[one])
+    typer.echo(
+        f"{sum(report.stages_s.values()):.0f} s, of which {report.stages_s[longest]:.0f} s: "
+        f"{longest}"
+    )

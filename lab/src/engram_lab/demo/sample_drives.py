@@ -19,11 +19,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.calibration import Cameras
+from engram.calibration.cameras import Cameras
 from engram.calibration.toml import calibration_toml
-from engram.frontend import StereoPair
-from engram.sequences.trajectories import Trajectory, write_tum
-from engram_lab.town import SimulatedDrive, campaign_named
+from engram.frontend.frame import StereoPair
+from engram.sequences.motion import Trajectory, write_tum
+from engram_lab.town.campaigns import campaign_named
+from engram_lab.town.session import SimulatedDrive
 
 _CAMPAIGN = "hamlet"
 _ZONE = "Europe/London"

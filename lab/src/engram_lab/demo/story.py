@@ -11,22 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.localiser import Localisation
-from engram.maps import Map, open_map
+from engram.localiser.localisation import Localisation
+from engram.maps.map import Map, open_map
 from engram.monitor import QUIET, Monitor
-from engram.robot import (
-    MapReport,
-    RobotOptions,
-    Settings,
-    map_drive,
-    open_drive,
-    robot_on,
-    summarise,
-)
-from engram.viewing import Track, draw_from_above
-from engram.viewing.canvas import save, subplots
-from engram.viewing.pictures import PictureWriter
-from engram_lab.town import SimulatedDrive, campaign_named
+from engram.robot.mapping import MapReport, map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import robot_on, summarise
+from engram.sequences.opening import open_drive
+from engram.viewing.pictures import PictureWriter, Track, draw_from_above, save, subplots
+from engram_lab.town.campaigns import campaign_named
+from engram_lab.town.session import SimulatedDrive
 from engram_lab.town.simulating import simulate
 
 _CAMPAIGN = "hamlet"

@@ -15,15 +15,18 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.frontend import Frame, Frontend, FrontendConfig, MatcherConfig, StereoPair, match_frames
-from engram.geometry import SE3
-from engram.sequences import open_drive
+from engram.frontend.frame import Frame, StereoPair
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.frontend.matching import MatcherConfig, match_frames
+from engram.geometry.se3 import SE3
+from engram.sequences.opening import open_drive
 from engram_lab.bench.data import scale_and_crop
 from engram_lab.charts import Line as Curve
 from engram_lab.charts import Panel, draw_curves
 from engram_lab.programs import command_line
 from engram_lab.studies.pages import write_csv
-from engram_lab.town import SimulatedDrive, campaign_named
+from engram_lab.town.campaigns import campaign_named
+from engram_lab.town.session import SimulatedDrive
 
 MIN_INLIERS = 20
 NEAR_M = 0.25

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.config import config_hash
-from engram.frontend import StereoPair
-from engram.geometry import SE3
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
 from engram.monitor import QUIET, Monitor
 from engram_lab.fits.reference_matcher import (
     SUCCESS_INLIERS,
@@ -25,10 +25,9 @@ from engram_lab.fits.reference_matcher import (
 from engram_lab.town.camera_model import CONSTANTS
 from engram_lab.town.campaigns import WORLD_VERSION
 from engram_lab.town.conditions import WEATHERS
-from engram_lab.town.drive import DrivingStyle
-from engram_lab.town.robots import ROBOTS
+from engram_lab.town.drive import ROBOTS, DrivingStyle
+from engram_lab.town.rendering import VISITS, Places, Visit
 from engram_lab.town.textures import Style
-from engram_lab.town.visits import VISITS, Places, Visit
 
 MAPPED = "morning"
 # The towns that the knobs were set on, and two that were looked at only afterwards.

@@ -6,7 +6,7 @@
 Robots drive in small towns by day and night: undisturbed, told a wrong place, carried elsewhere,
 past gaps, lost, and lost in another town. Each of their matches is a row: what was known of it, and
 whether it was right, within 1 m and 5°. Misplaced robots meet look-alikes too rarely to learn from,
-so all of them are searched for (`engram_lab.wrong_places`) and added; the constants are corrected
+so all of them are searched for (`engram_lab.misplaced`) and added; the constants are corrected
 for their number. A logistic model is fitted for each reading of a match, and then a calibration of
 what would be claimed of the matches that robots met. On the held-out towns, without those
 look-alikes, log loss is compared with that of a logistic in inliers alone, and bin by bin how many
@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from engram.cli.progress import Bars
-from engram.frontend import BRIEF, DescriptorKind
-from engram.localiser import METHOD_VERSION, AcceptanceConfig, Spread
+from engram.cli.screen import Bars
+from engram.frontend.frame import BRIEF, DescriptorKind
+from engram.localiser.acceptance import AcceptanceConfig, Spread
 from engram.localiser.confidence import (
     ANYWHERE_TERMS,
     DOUBTED_TERMS,
@@ -41,9 +41,20 @@ from engram.localiser.confidence import (
     Standing,
     confidence_of,
 )
+from engram.localiser.settings import METHOD_VERSION
 from engram.monitor import Monitor, write_whole
-from engram.robot import Settings
-from engram_lab.misplaced import FALSE_M, FALSE_RAD, SURE, Kind, Looked, Street, Try
+from engram.robot.settings import Settings
+from engram_lab.misplaced import (
+    FALSE_M,
+    FALSE_RAD,
+    LEAST_INLIERS,
+    SURE,
+    Kind,
+    Looked,
+    Street,
+    Try,
+    WrongPlaces,
+)
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.studies.drives import drives_of
 from engram_lab.town.campaigns import BESIDE, MAPPED, estate
@@ -57,7 +68,6 @@ from engram_lab.trial_towns import (
     streets,
     towns_folder,
 )
-from engram_lab.wrong_places import LEAST_INLIERS, WrongPlaces
 
 Array = NDArray[np.float64]
 

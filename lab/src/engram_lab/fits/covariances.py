@@ -21,10 +21,11 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.stats import chi2
 
-from engram.frontend import Frame, MatcherConfig, match_frames
-from engram.geometry import SE3
-from engram.odometry import Odometry, OdometryConfig
-from engram.robot import Settings
+from engram.frontend.frame import Frame
+from engram.frontend.matching import MatcherConfig, match_frames
+from engram.geometry.se3 import SE3
+from engram.odometry.odometry import Odometry, OdometryConfig
+from engram.robot.settings import Settings
 from engram_lab.accuracy import LEVELS, squared
 from engram_lab.misplaced import FALSE_M, FALSE_RAD
 from engram_lab.programs import Figure, command_line, numbers, report

@@ -17,9 +17,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 from engram.graph.model import node_id
-from engram.localiser import AcceptanceConfig, Position
+from engram.localiser.acceptance import AcceptanceConfig
+from engram.localiser.localisation import Position
 from engram.odometry.motion import GapFiller, Motion
 from engram_lab.programs import command_line
 from engram_lab.studies.drives import EvaluatedDrive, open_campaign

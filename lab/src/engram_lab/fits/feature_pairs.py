@@ -15,10 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import Frontend, FrontendConfig, Landmarks, MatcherConfig, match_frames
-from engram.geometry import SE3, StereoCamera
-from engram_lab.eyes import Patches, Scene, clip, same_corners
-from engram_lab.eyes.scenes import DARK, WET
+from engram.frontend.frame import Landmarks
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.frontend.matching import MatcherConfig, match_frames
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+from engram_lab.eyes import DARK, WET, Patches, Scene, clip, same_corners
 
 # Image pairs a step, corners and further corners (rivals only) of each.
 _PAIRS, _CORNERS, _RIVALS = 5, 96, 48

@@ -24,20 +24,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
-from engram.fleet.download import DownloadOptions
-from engram.fleet.download.daylight import DUSK_DEG, LOW_DEG
-from engram.fleet.download.forecast import (
+from engram.fleet.download.coverage import (
     ALIKE_DEG,
     BINS,
+    DUSK_DEG,
     INTERVALS,
     LEVEL,
+    LOW_DEG,
     MOST_DRIVES,
     Interval,
     Weather,
 )
-from engram.graph.sun import sun_height_deg
+from engram.fleet.download.mission import DownloadOptions
+from engram.graph.clock import sun_height_deg
 from engram.measures import route_not_localised
-from engram.robot import RobotOptions, Settings, map_drive, open_drive
+from engram.robot.mapping import map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 from engram_lab.town.conditions import OXFORD
 from engram_lab.trial import try_downloads
 

@@ -25,25 +25,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from engram.localiser import Budget
-from engram.maps import Map, open_map
-from engram.odometry import GapFiller, OdometryStatus, OdometryStep
-from engram.ranking import (
-    Foreseen,
-    RankingContext,
-    RankingPolicy,
-    RecentAttempts,
-    RunLog,
-    policy_named,
-)
+from engram.localiser.localisation import Budget
+from engram.maps.map import Map, open_map
+from engram.odometry.motion import GapFiller
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.ranking.context import Foreseen, RankingContext, RankingPolicy
+from engram.ranking.policies import policy_named
 from engram.ranking.recall import RECALL, RecallConstants, RecallPolicy
-from engram.robot import Settings
+from engram.ranking.recent import RecentAttempts, RunLog
 from engram.robot.localisers import localiser_in
+from engram.robot.settings import Settings
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.studies.building import GENEROUS, build_map, true_nodes
 from engram_lab.studies.drives import EvaluatedDrive, campaign_logs, drives_of
-from engram_lab.studies.memo import MatchMemo
-from engram_lab.town import campaign_named
+from engram_lab.studies.lockstep import MatchMemo
+from engram_lab.town.campaigns import campaign_named
 from engram_lab.town.simulating import campaigns_folder
 
 SEARCHED: dict[str, tuple[Any, ...]] = {

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import StereoPair
+from engram.frontend.frame import StereoPair
 from engram.frontend.opencv_contrib import xfeatures2d
-from engram.geometry import SE3
+from engram.geometry.se3 import SE3
 
 _FAST_THRESHOLD = 8
 _CELL_PX = (64, 48)

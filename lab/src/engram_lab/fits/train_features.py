@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-import engram.frontend.network
-from engram.cli.progress import Bars
+import engram.frontend.features
+from engram.cli.screen import Bars
 from engram.monitor import Monitor, write_whole
 from engram_lab.eyes import Patches, training_scene
 from engram_lab.fits.feature_network import BITS, PatchNetwork, Sign
@@ -164,14 +164,14 @@ def _note(file: Path, step: int, recent: list[tuple[float, float]], rate_s: floa
 
 def ship(network: PatchNetwork, towns: list[Source], about: dict[str, str]) -> str:
     """Writes the package's weights and the model that it names; returns that model."""
-    folder = Path(engram.frontend.network.__file__).parent
+    folder = Path(engram.frontend.features.__file__).parent
     views = [town.views[visit, 5] for town in towns[:1] for visit in (0, 5, 8, 10, 14)]
     patches = np.concatenate(
         [Patches(one.image).around(one.landmarks.pixels, one.landmarks.octaves) for one in views]
     )
     body, model = weights_file(integer_weights(network, patches), about)
     (folder / "data" / "net.safetensors").write_bytes(body)
-    code = folder / "network.py"
+    code = folder / "features.py"
     text = re.sub(r'(?m)^MODEL = ".*"$', f'MODEL = "{model}"', code.read_text(encoding="utf-8"))
     code.write_text(text, encoding="utf-8")
     return model

@@ -18,21 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
-from engram import _core, places
-from engram.frontend import (
-    BRIEF,
-    TEBLID,
-    DescriptorKind,
-    Frontend,
-    FrontendConfig,
-    feature_kind,
-)
-from engram.frontend.features import NET, plain_name
-from engram.frontend.network import NETWORK_BITS
-from engram.places import TrainingConfig, encode_vocabulary, train_vocabulary
-from engram.places.signature import SHARE, members_of
+from engram import _core
+from engram.frontend.features import NET, NETWORK_BITS, feature_kind, plain_name
+from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.places.recognisers import SHARE, __file__, members_of
+from engram.places.vocabulary import TrainingConfig, encode_vocabulary, train_vocabulary
 from engram_lab.eyes import training_scene
-from engram_lab.town import SimulatedDrive, campaign_named
+from engram_lab.town.campaigns import campaign_named
+from engram_lab.town.session import SimulatedDrive
 
 # Campaign, seed, sessions, metres between frames: places apart from each other, all conditions.
 DRIVES = (
@@ -116,7 +110,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="keeps the descriptors of the drives")
     parser.add_argument("--kinds", default="brief,teblid", help="joined by commas")
     asked = parser.parse_args()
-    data = Path(places.__file__).parent / "data"
+    data = Path(__file__).parent / "data"
     for name in asked.kinds.split(","):
         kind = feature_kind(name).name
         drives = kind in {BRIEF, TEBLID}

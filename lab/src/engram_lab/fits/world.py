@@ -17,13 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.cli.progress import Bars
+from engram.cli.screen import Bars
 from engram.errors import SequenceError
-from engram.frontend import StereoPair
-from engram.geometry import SE3
+from engram.frontend.frame import StereoPair
+from engram.geometry.se3 import SE3
 from engram.measures import Drive, route_not_localised
 from engram.monitor import QUIET, Monitor
-from engram.robot import RobotOptions, Settings
+from engram.robot.settings import RobotOptions, Settings
 from engram.sequences.opening import open_drive
 from engram_lab.fits.calibration import (
     CLIP_FRAMES,
@@ -41,12 +41,12 @@ from engram_lab.fits.calibration import (
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.studies.configurations import UNLIMITED, Configuration
 from engram_lab.studies.drives import DriveSet, campaign_logs, drives_of
+from engram_lab.studies.lockstep import read_runs
 from engram_lab.studies.running import Plan, RankingOptions, built_map, make_plan, run
-from engram_lab.studies.store import read_runs
-from engram_lab.town import Campaign, SimulatedDrive, Size, campaign_named
-from engram_lab.town.campaigns import by_day
+from engram_lab.town.campaigns import Campaign, Size, by_day, campaign_named
+from engram_lab.town.rendering import LOOP_M, VISITS, Places
+from engram_lab.town.session import SimulatedDrive
 from engram_lab.town.simulating import simulate
-from engram_lab.town.visits import LOOP_M, VISITS, Places
 
 LAPS = 40
 # The laps whose five folds leave 20 to build from.

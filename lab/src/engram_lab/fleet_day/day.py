@@ -5,24 +5,127 @@ from __future__ import annotations
 import shutil
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from engram.agent import enrol
-from engram.centre.access.enrolment import add_person, new_code
-from engram.centre.access.roles import Role
+from engram.agent.link import enrol
+from engram.centre.access import Role, add_person, new_code
 from engram.centre.service import Centre
 from engram.config import plain
-from engram.maps import Map, check_file
-from engram.monitor import QUIET, Monitor
-from engram_lab.fleet_day.proxy import cutting
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
+from engram.monitor import QUIET, Monitor, Relay
 from engram_lab.fleet_day.robot import DayRobot, Foray
-from engram_lab.fleet_day.stages import Stages
-from engram_lab.town import campaign_named
+from engram_lab.town.campaigns import campaign_named
 from engram_lab.town.simulating import simulate
+
+_PIECE = 16_384
+_LONGEST_S = 60.0
+
+
+class CuttingProxy:
+    """Forwards connections to a port of this machine.
+
+    Args:
+        port: where to.
+        cut_bytes: a connection is dropped when this much has passed it, both ways together.
+
+    Attributes:
+        port: where it listens.
+        cuts: connections dropped.
+        passed_bytes: both ways, of all connections.
+    """
+
+    def __init__(self, port: int, cut_bytes: int) -> None:
+        self._target = port
+        self._cut_bytes = cut_bytes
+        self._lock = threading.Lock()
+        self.cuts = 0
+        self.passed_bytes = 0
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._listener.getsockname()[1]
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def close(self) -> None:
+        """Stops listening."""
+        with suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+
+    def _accept(self) -> None:
+        with suppress(OSError):  # closed
+            while True:
+                ours, _ = self._listener.accept()
+                try:
+                    theirs = socket.create_connection(("127.0.0.1", self._target))
+                except OSError:  # nobody there now: the caller hears it, others may come
+                    ours.close()
+                    continue
+                left = [self._cut_bytes]
+                for source, sink in ((ours, theirs), (theirs, ours)):
+                    source.settimeout(_LONGEST_S)
+                    threading.Thread(
+                        target=self._forward, args=(source, sink, left), daemon=True
+                    ).start()
+
+    def _forward(self, source: socket.socket, sink: socket.socket, left: list[int]) -> None:
+        with suppress(OSError):  # the other way was dropped
+            while piece := source.recv(_PIECE):
+                with self._lock:
+                    part = piece[: left[0]]
+                    is_cut = len(part) == left[0]
+                    self.cuts += is_cut and bool(part)  # once, not once a direction
+                    left[0] -= len(part)
+                    self.passed_bytes += len(part)
+                sink.sendall(part)
+                if is_cut:
+                    break
+        for one in (source, sink):
+            with suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+            one.close()
+
+
+@contextmanager
+def cutting(port: int, cut_bytes: int) -> Iterator[CuttingProxy]:
+    """A proxy for the length of a block."""
+    proxy = CuttingProxy(port, cut_bytes)
+    try:
+        yield proxy
+    finally:
+        proxy.close()
+
+
+class Stages(Relay):
+    """Reports each stage as it begins, and how long it took when it ends.
+
+    Args:
+        inner: hears of every item.
+        tell: takes a line.
+
+    Attributes:
+        took: stage → seconds, in their order.
+    """
+
+    def __init__(self, inner: Monitor, tell: Callable[[str], object]) -> None:
+        super().__init__(inner)
+        self._tell = tell
+        self.took: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, what: str, total: int) -> Iterator[Monitor]:
+        """See `Monitor`."""
+        self._tell(f"{what} …")
+        begun_s = time.monotonic()
+        with super().stage(what, total) as part:
+            yield part
+        self.took[what] = time.monotonic() - begun_s
+        self._tell(f"{what}: {self.took[what]:.1f} s")
+
 
 _CAMPAIGN, _MAP = "hamlet", "fleet"
 _CUT_BYTES = 200_000
@@ -128,7 +231,7 @@ def listening(centre: Centre) -> Iterator[int]:
     """Serves a centre on a free port of this machine, without a worker."""
     import uvicorn
 
-    from engram.centre.api.app import create_app
+    from engram.centre.app import create_app
 
     config = uvicorn.Config(
         create_app(centre), log_level="error", timeout_graceful_shutdown=_FAREWELL_S

@@ -10,19 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from engram.agent import Agent, AgentSettings
-from engram.agent.agent import MAP
+from engram.agent.agent import MAP, Agent
 from engram.agent.link import Unreachable
-from engram.agent.sending import QUEUED, SENT
+from engram.agent.outbox import QUEUED, SENT
+from engram.agent.state import AgentSettings
+from engram.centre.merging import merge_hand_in
 from engram.centre.service import Centre
-from engram.centre.worker.loop import work_off
-from engram.centre.worker.merging import merge_hand_in
+from engram.centre.worker import work_off
 from engram.errors import EngramError
-from engram.geometry import SE3
-from engram.localiser import Position
-from engram.maps import Map, copy_map
+from engram.geometry.se3 import SE3
+from engram.localiser.localisation import Position
+from engram.maps.map import Map
+from engram.maps.map_files import copy_map
 from engram.monitor import Monitor
-from engram.robot import Beginning, map_drive, open_drive
+from engram.robot.mapping import Beginning, map_drive
+from engram.sequences.opening import open_drive
 from engram_lab.truth import read_truth
 
 # Rounds in which a hand-in or a download is over. Each broken connection takes one, and what

@@ -6,8 +6,7 @@ import random
 import shutil
 from pathlib import Path
 
-from engram_lab.mutations.case import Case, Subject
-from engram_lab.mutations.samples import Samples
+from engram_lab.mutations.case import Case, Samples, Subject
 
 _PAGE = 4096
 _LOG_HEADER, _LOG_FRAME = 32, 24 + _PAGE

@@ -1,17 +1,202 @@
-"""One changed file, or hand-in."""
+"""One changed file or hand-in, the sound ones to change, and values that are wrong or extreme."""
 
 from __future__ import annotations
 
+import json
 import random
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
-from engram.transfers import PartHash
-from engram.transfers.manifest import Manifest
-from engram_lab.mutations.samples import Samples
+import cv2
+import msgspec
+import numpy as np
+
+from engram.frontend.blobs import decode_landmarks
+from engram.frontend.frame import Frame, FrameStatus
+from engram.geometry.se3 import SE3
+from engram.graph.model import (
+    Amendable,
+    Anchor,
+    Attempt,
+    Clock,
+    Edge,
+    EdgeKind,
+    Goal,
+    Mark,
+    Node,
+    NodeId,
+    Omission,
+    PathEntry,
+    PathEntryKind,
+    Placement,
+    Removal,
+    Session,
+    path_id,
+)
+from engram.maps.map import Map
+from engram.maps.map_files import copy_map
+from engram.maps.writer import RevisionWriter
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.places.vocabulary import encode_vocabulary, one_word_vocabulary
+from engram.sequences.framelog.file import FrameLogHeader
+from engram.sequences.framelog.writer import FlightWriter, FrameLogWriter
+from engram.sequences.sequence import LoggedFrame, SequenceInfo
+from engram.transfers import Manifest, PartHash, split
+from engram_lab.synthetic_places import (
+    CAMERA,
+    DESCRIPTOR,
+    FRONTEND,
+    drive_of,
+    landmark_bytes,
+    node_of,
+)
+
+_LANDMARKS = 12
+_NODES = 4
+_COVARIANCE = np.eye(6) * 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Files of every kind that strangers give.
+
+    Attributes:
+        town: a map, every table of which has rows.
+        logged: the same map, whose last revisions are in a log beside it.
+        framelog, flight: drives.
+        manifest: what the map consists of, as a robot hands it in.
+        parts: its pages and blobs.
+    """
+
+    town: Path
+    logged: Path
+    framelog: Path
+    flight: Path
+    manifest: Manifest
+    parts: dict[PartHash, bytes]
+
+
+def make_samples(folder: Path) -> Samples:
+    """Makes them in a folder."""
+    town, logged = folder / "town.engram", folder / "logged.engram"
+    _make_map(town)
+    _make_logged(town, logged)
+    framelog, flight = folder / "drive.framelog", folder / "drive.flight"
+    with FrameLogWriter(framelog, _header()) as writer:
+        _record(writer)
+    with FlightWriter(flight, _header()) as record:
+        record.add_report({"reason": "lost", "robot": "r1"}, frames=_NODES, images=_NODES)
+        _record(record)
+    taken = split(town)
+    names = [*taken.pages, *taken.blobs]
+    parts = dict(zip(names, taken.parts(names), strict=True))
+    return Samples(town, logged, framelog, flight, taken.manifest, parts)
+
+
+def frame_of(stamp_ns: int) -> Frame:
+    """A frame of a few random landmarks with a thumbnail, by its stamp."""
+    blob = landmark_bytes(np.random.default_rng(stamp_ns), None, _LANDMARKS)
+    picture = np.add.outer(np.arange(24), np.arange(32)).astype(np.uint8)
+    landmarks = decode_landmarks(blob, CAMERA, DESCRIPTOR)
+    return Frame(stamp_ns, CAMERA, landmarks, DESCRIPTOR, FRONTEND, FrameStatus.OK, picture)
+
+
+def _make_map(path: Path) -> None:
+    with Map.create(path) as store:
+        first = _drive(store, drive_of("r1", 1_000))
+        _drive(store, drive_of("r2", 2_000_000_000))
+        _drive(store, drive_of("r3", 4_000_000_000))
+        with store.begin_revision(author="lab", message="marks", configuration={"a": 1}) as writer:
+            for mark in _marks(first):
+                writer.add_mark(mark)
+            gone = node_of(drive_of("r4", 1), 1, 0.0).id
+            writer.add_omission(Omission(gone, first[0], SE3.identity(), bytes(range(16))))
+            writer.put_statistic("speed", {"mean": 1.5})
+            writer.commit()
+        words = encode_vocabulary(one_word_vocabulary(DESCRIPTOR))
+        store.put_vocabulary(words, author="lab", message="words", configuration={})
+        store.put_words(bytes(16), {node: np.array([3, 5, 700]) for node in first})
+        session = next(iter(store.sessions))
+        store.amend(session, {Amendable.ROBOT: "renamed"}, author="lab")
+        store.revert(2, author="lab", message="loose camera")
+        store.tag("good", 1, author="lab", message="it works")
+        store.tag("best", author="lab")
+
+
+def _make_logged(town: Path, path: Path) -> None:
+    """A copy of the map with one more revision and tag, which only the log contains."""
+    draft = path.with_name("draft.engram")
+    copy_map(town, draft)
+    with Map.open(draft, writes=True) as store:
+        _drive(store, drive_of("r5", 6_000_000_000))
+        store.tag("late", author="lab")
+        for suffix in ("", "-wal"):  # before the last connection folds the log into the file
+            shutil.copyfile(f"{draft}{suffix}", f"{path}{suffix}")
+
+
+def _drive(store: Map, drive: Session) -> list[NodeId]:
+    writer = store.begin_session(
+        drive,
+        CAMERA,
+        descriptor=DESCRIPTOR,
+        frontend=FRONTEND,
+        author=drive.robot,
+        configuration={"mapper": {"distance_m": 1.0}},
+    )
+    nodes = [node_of(drive, drive.start_ns + at * 10**8, float(at)) for at in range(_NODES)]
+    for at, node in enumerate(nodes):
+        writer.add_node(node, frame_of(node.stamp_ns))
+        entry = PathEntry(path_id(drive.id), at, node.id, PathEntryKind.SAVED, node.stamp_ns)
+        writer.add_path_entry(entry)
+        if at:
+            _tie(writer, nodes[at - 1], node, at)
+    writer.commit()
+    return [node.id for node in nodes]
+
+
+def _tie(writer: RevisionWriter, before: Node, node: Node, at: int) -> None:
+    step = SE3(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    writer.add_edge(Edge(before.id, node.id, EdgeKind.ODOMETRY, step, _COVARIANCE))
+    writer.add_attempts(
+        [Attempt(at, before.id, node.id, 1.0, 0.0, 0.0, 0.25, 0.01, True, 30, 1, "distance")]
+    )
+
+
+def _marks(nodes: list[NodeId]) -> Iterator[Mark]:
+    here = SE3.identity()
+    yield Removal(nodes[0], nodes[1], EdgeKind.MATCH, here, "look-alike", 5)
+    yield Placement(nodes[0], here)
+    yield Anchor(nodes[1], 1.0, 2.0, None, 0.5, "survey")
+    yield Goal("dock", nodes[2], here)
+
+
+def _header() -> FrameLogHeader:
+    info = SequenceInfo("drive", "kitti", Clock.UTC, "r1", 14.4, "Europe/Prague")
+    return FrameLogHeader(info, CAMERA, DESCRIPTOR, FRONTEND, "odometry", "")
+
+
+def _record(writer: FrameLogWriter) -> None:
+    for at in range(_NODES):
+        step = (
+            OdometryStep(OdometryStatus.OK, SE3.identity(), _COVARIANCE, 50)
+            if at
+            else OdometryStep(OdometryStatus.FIRST)
+        )
+        writer.append(LoggedFrame(frame_of(1_000 + at * 10**8), step), f"pair{at}")
+        if isinstance(writer, FlightWriter):
+            writer.add_decision({"status": "localised", "node": at})
+            writer.add_images(*_images())
+
+
+def _images() -> tuple[bytes, bytes]:
+    import cv2
+
+    grey = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    return (cv2.imencode(".jpg", grey)[1].tobytes(),) * 2
 
 
 class Subject(StrEnum):
@@ -47,3 +232,160 @@ class Case:
 
 # Changes a copy of a sample, made in the folder.
 Change: TypeAlias = Callable[[Samples, Path, random.Random], Case]
+
+
+_INTS = (0, 1, -1, 2, 127, 255, 65_535, 65_536, 2**31, -(2**31), 2**40, 2**62, 2**63 - 1, -(2**63))
+_FLOATS = (0.0, -0.0, -1.0, 1e-320, 1e300, -1e300, float("inf"), float("-inf"))
+_DEEP = 100_000
+
+
+def integer(value: int, chance: random.Random) -> int:
+    """Another number of 64 bits."""
+    near = value + chance.choice([-1, 1, 256])
+    return chance.choice([*_INTS, near if abs(near) < 2**62 else 0])
+
+
+def real(value: float, chance: random.Random) -> float:
+    """Another number, infinities included; SQLite keeps no NaN."""
+    return chance.choice([*_FLOATS, value * 2, value + 1e-9])
+
+
+def text(value: str, chance: random.Random) -> str:
+    """Another text: empty, long, with control characters, or bad JSON."""
+    wild = "\x1b]0;owned\x07\x1b[2J\u202e\r\n"
+    made = [
+        "",
+        wild,
+        value + wild,
+        value[:-1],
+        "x" * 1_000_000,
+        "1" * 10_000,
+        "[" * _DEEP,
+        '{"a":' * _DEEP,
+        '{"a": 1e999, "b": NaN}',
+        '{"a": ' + "9" * 5_000 + "}",
+        '{"a": ' + "[" * 900 + "]" * 900 + "}",
+        '{"a": null, "merge": [], "nodes": "many", "frames": -1}',
+        "null",
+        '"\\ud800"',
+        "\u0000",
+        "../../etc/passwd",
+    ]
+    if value.startswith("{") and chance.random() < 0.5:
+        return bent_json(value, chance)
+    return chance.choice(made)
+
+
+def bent_json(value: str, chance: random.Random) -> str:
+    """The object with one value of another kind, anywhere in it."""
+    content = json.loads(value)
+    holders = [content]
+    for one in holders:
+        inner = one.values() if isinstance(one, dict) else one
+        holders += [some for some in inner if isinstance(some, dict | list) and some]
+    holder = chance.choice(holders)
+    if not holder:
+        return '{"merge": 1}'
+    key = chance.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
+    holder[key] = chance.choice([None, -1, 2**70, 1e300, "x", [], {}, [[]], {"a": {}}, True])
+    return json.dumps(content)
+
+
+def blob(value: bytes, chance: random.Random) -> bytes:
+    """Other bytes: flipped, cut, grown, not finite, or a large run."""
+    match chance.randrange(7):
+        case 0:
+            return b""
+        case 1:
+            return value[: chance.randrange(len(value) + 1)]
+        case 2:
+            return value + chance.randbytes(chance.randint(1, 64))
+        case 3:
+            return np.full(len(value) // 8, chance.choice([np.nan, np.inf, 1e300])).tobytes()
+        case 4 if chance.random() < 0.05:
+            return bytes(64 * 2**20)
+        case _:
+            return flipped(value, chance)
+
+
+def flipped(value: bytes, chance: random.Random) -> bytes:
+    """A few bits changed."""
+    if not value:
+        return b"\0"
+    body = bytearray(value)
+    for _ in range(chance.choice([1, 1, 2, 8])):
+        body[chance.randrange(len(body))] ^= 1 << chance.randrange(8)
+    return bytes(body)
+
+
+def landmarks(body: bytes, chance: random.Random) -> bytes:
+    """A safetensors file whose header or arrays are wrong."""
+    length = int.from_bytes(body[:8], "little")
+    header, arrays = body[8 : 8 + length], body[8 + length :]
+    match chance.randrange(6):
+        case 0:
+            header = flipped(header, chance)
+        case 1:
+            header = _bent_header(header.decode(), chance).encode()
+        case 2:
+            header = chance.choice([b"[" * _DEEP, b'{"a":' * _DEEP, b"{}", b""])
+        case 3:
+            arrays = flipped(arrays, chance)
+        case 4:
+            arrays = bytes(len(arrays))
+        case _:
+            length = chance.choice([0, 2**31, 2**63, 2**64 - 1, length + 1])
+            return length.to_bytes(8, "little") + header + arrays
+    return len(header).to_bytes(8, "little") + header + arrays
+
+
+def _bent_header(header: str, chance: random.Random) -> str:
+    """The header with a wrong value in it, or in the JSON that its own metadata hold."""
+    about = json.loads(header).get("__metadata__", {})
+    within = [key for key, value in about.items() if value.startswith("{")]
+    if not within or chance.random() < 0.3:
+        return bent_json(header, chance)
+    about[within[0]] = bent_json(about[within[0]], chance)
+    return json.dumps(json.loads(header) | {"__metadata__": about})
+
+
+def picture(value: bytes, chance: random.Random) -> bytes:
+    """A JPEG whose size is a lie, whose body is wrong, or another format."""
+    body = bytearray(value)
+    match chance.randrange(5):
+        case 0:
+            at = body.index(b"\xff\xc0")
+            sides = chance.choice([(1024, 1024), (65_535, 65_535), (0, 0), (1, 1024)])
+            body[at + 5 : at + 9] = b"".join(side.to_bytes(2, "big") for side in sides)
+        case 1:
+            second = b"\xff\xc0\x00\x0b\x08\xff\xff\xff\xff\x01\x01\x11\x00"
+            at = chance.choice([2, body.index(b"\xff\xda")])
+            body[at:at] = second
+        case 2:
+            return cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
+        case 3:
+            return bytes(body[:2]) + b"\xff\xe1\x00\x00" * chance.choice([1, 50_000])
+        case _:
+            return flipped(value, chance)
+    return bytes(body)
+
+
+def packed_attempts(value: bytes, chance: random.Random) -> bytes:
+    """MessagePack of attempts with other contents, or depth, or promised lengths."""
+    content: dict[str, Any] = msgspec.msgpack.decode(value)
+    match chance.randrange(6):
+        case 0:
+            content["base"] = chance.choice([2**61, -(2**61), 2**62, 2**63 - 1])
+        case 1:
+            content["policies"] = chance.choice([[], ["\x1b[31m"], ["x"] * 100_000])
+        case 2:
+            content["nodes"] = blob(content["nodes"], chance)
+        case 3:
+            content["rows"] = blob(content["rows"], chance)
+        case 4:
+            return chance.choice(
+                [b"\x91" * _DEEP, b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff"]
+            )
+        case _:
+            return flipped(value, chance)
+    return msgspec.msgpack.encode(content)

@@ -8,8 +8,7 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-from engram_lab.mutations.case import Case, Subject
-from engram_lab.mutations.samples import Samples
+from engram_lab.mutations.case import Case, Samples, Subject
 
 # Whoever evaluates one of these calls a function that Engram itself never calls.
 _EXPRESSIONS = (

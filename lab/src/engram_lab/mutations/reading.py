@@ -11,22 +11,24 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from engram.calibration import calibration_toml, read_calibration
-from engram.calibration.toml import CalibrationFile
-from engram.centre.worker.admission import write_checked
+from engram.calibration.formats import read_calibration
+from engram.calibration.toml import CalibrationFile, calibration_toml
+from engram.centre.merging import write_checked
 from engram.cli.settings import read_settings
 from engram.config import load_toml
 from engram.errors import EngramError
-from engram.fleet.merge import MergeOptions, merge
+from engram.fleet.merge.merging import merge
+from engram.fleet.merge.settings import MergeOptions
 from engram.graph.clock import check_zone, hour_of_day, zone_note
 from engram.graph.model import Clock
-from engram.maps import Map, check_file, copy_map
-from engram.places import decode_vocabulary
-from engram.sequences import FrameLog, SequenceInfo
+from engram.maps.map import Map
+from engram.maps.map_files import check_file, copy_map
+from engram.places.vocabulary import decode_vocabulary
 from engram.sequences.framelog.file import FLIGHT_SUFFIX
-from engram.sequences.framelog.flight import read_decisions, read_images, read_report
-from engram.transfers import Manifest, split
-from engram.transfers.manifest import decode_manifest
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.framelog.writer import read_decisions, read_images, read_report
+from engram.sequences.sequence import SequenceInfo
+from engram.transfers import Manifest, decode_manifest, split
 from engram_lab.mutations.case import Case, Subject
 
 Held = dict[str, list[tuple[Any, ...]]]

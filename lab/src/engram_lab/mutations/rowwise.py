@@ -15,11 +15,9 @@ from sqlalchemy import Table
 from engram.frontend.blobs import content_digest
 from engram.maps.rows import sealed
 from engram.maps.schema import frames, metadata, nodes
-from engram.sequences.framelog.file import frames_table, log_digest, log_table
-from engram.sequences.framelog.rows import row_digest
-from engram_lab.mutations import values
-from engram_lab.mutations.case import Case, Subject
-from engram_lab.mutations.samples import Samples
+from engram.sequences.framelog.file import frames_table, log_digest, log_table, row_digest
+from engram_lab.mutations import case
+from engram_lab.mutations.case import Case, Samples, Subject
 
 Row = dict[str, Any]
 
@@ -73,10 +71,10 @@ def of_a_drive(samples: Samples, folder: Path, chance: random.Random) -> Case:
 def changed_value(value: Any, chance: random.Random) -> Any:
     """A value of the same type."""
     ways: dict[type, Callable[[Any, random.Random], Any]] = {
-        int: values.integer,
-        float: values.real,
-        str: values.text,
-        bytes: values.blob,
+        int: case.integer,
+        float: case.real,
+        str: case.text,
+        bytes: case.blob,
     }
     return ways[type(value)](value, chance) if type(value) in ways else value
 
@@ -121,7 +119,7 @@ def _change(connection: sqlite3.Connection, table: Table, chance: random.Random,
 
 def _landmarks(connection: sqlite3.Connection, chance: random.Random) -> str:
     frame = _any_row(connection, frames, chance)
-    body = values.landmarks(frame["landmarks"][16:], chance)
+    body = case.landmarks(frame["landmarks"][16:], chance)
     digest_ = content_digest(body)
     _update(connection, frames, sealed(frames, {**frame, "landmarks": digest_ + body}))
     (node,) = _rows(connection, nodes, f"WHERE key = {frame['node']}")
@@ -131,7 +129,7 @@ def _landmarks(connection: sqlite3.Connection, chance: random.Random) -> str:
 
 def _thumbnail(connection: sqlite3.Connection, chance: random.Random) -> str:
     frame = _any_row(connection, frames, chance)
-    picture = values.picture(frame["thumbnail"], chance)
+    picture = case.picture(frame["thumbnail"], chance)
     _update(connection, frames, sealed(frames, {**frame, "thumbnail": picture}))
     return f"thumbnail of node row {frame['node']}"
 
@@ -139,7 +137,7 @@ def _thumbnail(connection: sqlite3.Connection, chance: random.Random) -> str:
 def _vocabulary(connection: sqlite3.Connection, chance: random.Random) -> str:
     table = metadata.tables["vocabularies"]
     row = _any_row(connection, table, chance)
-    body = values.landmarks(row["body"], chance)
+    body = case.landmarks(row["body"], chance)
     _update(connection, table, sealed(table, {**row, "body": body, "hash": content_digest(body)}))
     return f"vocabulary row {row['key']}"
 
@@ -147,7 +145,7 @@ def _vocabulary(connection: sqlite3.Connection, chance: random.Random) -> str:
 def _attempts(connection: sqlite3.Connection, chance: random.Random) -> str:
     table = metadata.tables["attempts"]
     row = _any_row(connection, table, chance)
-    body = values.packed_attempts(row["body"], chance)
+    body = case.packed_attempts(row["body"], chance)
     _update(connection, table, sealed(table, {**row, "body": body}))
     return f"attempts row {row['key']}"
 
@@ -155,7 +153,7 @@ def _attempts(connection: sqlite3.Connection, chance: random.Random) -> str:
 def _change_drive(connection: sqlite3.Connection, chance: random.Random, seal: bool) -> str:
     if chance.random() < 0.3:
         (row,) = _rows(connection, log_table)
-        header = values.text(row["header"], chance)
+        header = case.text(row["header"], chance)
         changed = {**row, "header": header}
         if seal:
             known = header.encode(errors="replace").decode()
@@ -178,7 +176,7 @@ def _change_drive(connection: sqlite3.Connection, chance: random.Random, seal: b
 
 def _drive_value(column: str, value: Any, chance: random.Random) -> Any:
     if column in {"landmarks", "thumbnail"}:
-        make = values.landmarks if column == "landmarks" else values.picture
+        make = case.landmarks if column == "landmarks" else case.picture
         body = make(value[16:], chance)
         return content_digest(body) + body
     return changed_value(value, chance)

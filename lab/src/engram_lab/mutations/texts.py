@@ -7,8 +7,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from engram_lab.mutations.case import Case, Subject
-from engram_lab.mutations.samples import Samples
+from engram_lab.mutations.case import Case, Samples, Subject
 
 _POSE = "[1, 0, 0, -0.12, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
 _RECTIFIED = """\

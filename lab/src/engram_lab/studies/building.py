@@ -1,4 +1,4 @@
-"""One map per fold, from its training sessions in the order of time (method §8)."""
+"""One map per fold, in the order of time (method §8), and its edges held against the truth."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -14,12 +14,15 @@ from typing import Any
 
 from engram.config import to_dict
 from engram.errors import InputError
-from engram.maps import Map
-from engram.robot import Beginning, MapReport, RobotOptions, Settings, map_drive
-from engram.sequences import FrameLog
-from engram_lab.studies.drives import EvaluatedDrive
+from engram.geometry.se3 import SE3
+from engram.graph.model import Edge, EdgeKind, NodeId
+from engram.localiser.localisation import Position
+from engram.maps.map import Map
+from engram.robot.mapping import Beginning, MapReport, map_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.framelog.reader import FrameLog
+from engram_lab.studies.drives import EvaluatedDrive, TrueNodes
 from engram_lab.studies.in_force import Values, of_revision, of_robot
-from engram_lab.studies.starting import TrueNodes
 
 # Enough for every candidate that matters; counts only, so that the same drives give the same map.
 # Folds are built beside each other, one thread each.
@@ -225,3 +228,41 @@ def write_json(path: Path, values: Any) -> None:
 def _remove(path: Path) -> None:
     for one in path.parent.glob(f"{path.name}*"):
         one.unlink()
+
+
+# An edge joins two places if it is further off than this, and than three standard deviations.
+OTHER_PLACE_M = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeError:
+    """How wrong an edge is.
+
+    Attributes:
+        kind: origin of the edge.
+        error_m: how far off it is, metres.
+        joins_places: whether it joins two places, which ruins a map. Where odometry had
+            lost track, edges are far off and say so.
+    """
+
+    kind: EdgeKind
+    error_m: float
+    joins_places: bool
+
+
+def edge_errors(
+    edges: Iterable[Edge], world_from_node: Callable[[NodeId], SE3 | None]
+) -> Iterator[EdgeError]:
+    """The errors of the edges between nodes whose true poses are known.
+
+    Args:
+        edges: of a map.
+        world_from_node: true pose of a node; None where it is not known.
+    """
+    for edge in edges:
+        a, b = world_from_node(edge.a), world_from_node(edge.b)
+        if a is None or b is None:
+            continue
+        error_m = (edge.a_from_b.inverse() @ (a.inverse() @ b)).distance_m
+        sigma_m = Position(edge.a, edge.a_from_b, edge.covariance).sigma_m
+        yield EdgeError(edge.kind, error_m, error_m > max(OTHER_PLACE_M, 3 * sigma_m))

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, fields, replace
 from enum import StrEnum
 from typing import Any
 
-from engram.localiser import Budget, LocaliserConfig
-from engram.localiser.settings import PathEntries
+from engram.localiser.localisation import Budget
+from engram.localiser.settings import LocaliserConfig, PathEntries
 
 # Lanes of a budget that never runs out.
 UNLIMITED = 1_000_000

@@ -1,25 +1,38 @@
-"""The drives that an evaluation runs on: a campaign's frame logs, or a user's own."""
+"""The drives that an evaluation runs on, in folds, and where each starts in a map (method §8)."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from shlex import quote
 
+import numpy as np
+from numpy.typing import NDArray
+
 from engram.config import config_hash
 from engram.errors import ConfigError, SequenceError
-from engram.frontend import DescriptorKind
-from engram.geometry import SE3, StereoCamera
-from engram.graph.model import Session
-from engram.robot import Settings, session_of_drive
-from engram.sequences import FrameLog, LoggedFrame
-from engram.sequences.trajectories import Trajectory
-from engram_lab.town import WORLD_VERSION, Campaign, Size, campaign_named
-from engram_lab.town.simulating import campaign_folder
-from engram_lab.town.upkeep import Upkeep, bring_up_to_date, known_frontends
+from engram.frontend.frame import DescriptorKind, FrameStatus
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+from engram.graph.basin import DEFAULT_RADIUS_M
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import NodeId, Session, SessionId, node_id
+from engram.localiser.acceptance import AcceptanceConfig, accept_lost
+from engram.localiser.attempts import Matcher
+from engram.localiser.localisation import Position
+from engram.maps.frame_reader import DEFAULT_CACHE_BYTES
+from engram.maps.map import Map
+from engram.robot.localisers import session_of_drive
+from engram.robot.settings import Settings
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.motion import Trajectory
+from engram.sequences.sequence import LoggedFrame
+from engram_lab.town.campaigns import WORLD_VERSION, Campaign, Size, campaign_named
+from engram_lab.town.simulating import Upkeep, bring_up_to_date, campaign_folder, known_frontends
 from engram_lab.truth import read_truth, truth_path
 
 
@@ -229,3 +242,194 @@ def _hash_of(path: Path) -> str | None:
         return None
     except OSError as error:
         raise SequenceError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Fold:
+    """One division of the sessions; numbers are places in the order of time.
+
+    Attributes:
+        number: 0, 1, ….
+        training: sessions that the map is built from, in the order of time.
+        held_out: sessions that are localised in it.
+    """
+
+    number: int
+    training: tuple[int, ...]
+    held_out: tuple[int, ...]
+
+
+def split(sessions: int, folds: int = 5, seed: int = 0) -> tuple[Fold, ...]:
+    """Every session is held out once; seeded shuffle, sizes within one. Source: method §8.
+
+    Raises:
+        ConfigError: fewer than two folds, or fewer sessions than folds.
+    """
+    if not 2 <= folds <= sessions:
+        raise ConfigError(
+            f"cannot split {sessions} sessions into {folds} folds; there must be at least 2 folds "
+            "and as many sessions as folds"
+        )
+    shuffled = np.random.default_rng(seed).permutation(sessions)
+    parts = [tuple(sorted(part.tolist())) for part in np.array_split(shuffled, folds)]
+    everyone = range(sessions)
+    return tuple(
+        Fold(number, tuple(one for one in everyone if one not in part), part)
+        for number, part in enumerate(parts)
+    )
+
+
+def chosen(folds: tuple[Fold, ...], only: tuple[int, ...]) -> tuple[Fold, ...]:
+    """Some folds by their numbers; all where none is named."""
+    return tuple(folds[number] for number in sorted(set(only))) if only else folds
+
+
+def check_only(only: tuple[int, ...], folds: int) -> None:
+    """Whether some requested folds exist.
+
+    Raises:
+        ConfigError: one does not.
+    """
+    strange = [one for one in only if not 0 <= one < folds]
+    if strange:
+        raise ConfigError(
+            f"folds {strange} are requested; {folds} folds are numbered from 0 to {folds - 1}"
+        )
+
+
+# What an operator who sets a robot down knows of its place.
+_SIGMA_M = 0.25
+_SIGMA_RAD = float(np.deg2rad(1.0))
+_VIEW_GATE_RAD = float(np.deg2rad(60.0))  # as for candidates, method §3.1
+
+
+class TrueNodes:
+    """True poses of a map's nodes.
+
+    Args:
+        opened: the map.
+        truths: of the sessions that it was built from; may lack some.
+    """
+
+    def __init__(self, opened: Map, truths: Mapping[SessionId, Truth | None]) -> None:
+        self._poses: dict[NodeId, SE3] = {}
+        for node in opened.graph.nodes:
+            truth = truths.get(node.session)
+            pose = None if truth is None else truth.at(node.stamp_ns)
+            if pose is not None:
+                self._poses[node.id] = pose
+        self._ids = list(self._poses)
+        self._in_main = _in_largest_component(opened.graph, self._ids)
+        poses = list(self._poses.values())
+        self._positions = np.array([pose.translation for pose in poses]).reshape(-1, 3)
+        self._headings = np.array([pose.rotation[:, 2] for pose in poses]).reshape(-1, 3)
+
+    def pose(self, node: NodeId) -> SE3 | None:
+        """``world_from_node``; None where it is not known."""
+        return self._poses.get(node)
+
+    def near(self, world_from_live: SE3, radius_m: float) -> set[NodeId]:
+        """The nodes that are truly within a radius and look in the same direction (method §3.1)."""
+        apart_m = np.linalg.norm(self._positions - world_from_live.translation, axis=1)
+        alike = self._headings @ world_from_live.rotation[:, 2] >= np.cos(_VIEW_GATE_RAD)
+        return {self._ids[k] for k in np.flatnonzero((apart_m <= radius_m) & alike)}
+
+    def start(self, world_from_live: SE3) -> Position | None:
+        """The position seen from the nearest node with the same heading; None without nodes.
+
+        Rather of those that hang together: what a drive saved where its odometry had lost track,
+        in heavy rain, may be joined to nothing, and a robot set down there would find no other
+        node all day.
+        """
+        if not self._ids:
+            return None
+        distance_m = np.linalg.norm(self._positions - world_from_live.translation, axis=1)
+        away = self._headings @ world_from_live.rotation[:, 2] < np.cos(_VIEW_GATE_RAD)
+        apart = ~self._in_main | (distance_m > DEFAULT_RADIUS_M)
+        # Nodes that look another way only where there are no others.
+        node = self._ids[int(np.lexsort((distance_m, apart, away))[0])]
+        covariance = np.diag([_SIGMA_M**2] * 3 + [_SIGMA_RAD**2] * 3)
+        return Position(node, self._poses[node].inverse() @ world_from_live, covariance)
+
+
+def _in_largest_component(graph: ExperienceGraph, nodes: Sequence[NodeId]) -> NDArray[np.bool_]:
+    """(N,) whether each node is in the graph's largest connected component."""
+    labels = graph.components()
+    largest = np.argmax(np.bincount(labels)) if len(labels) else -1
+    rows = np.array([graph.index(node) for node in nodes], np.int64)
+    return np.asarray(labels[rows] == largest)
+
+
+def start_by_matching(
+    opened: Map,
+    frames: Sequence[LoggedFrame],
+    live: SessionId,
+    matcher: Matcher,
+    acceptance: AcceptanceConfig,
+) -> tuple[int, Position] | None:
+    """The first frame that matches a node of the map, and its position there.
+
+    Every node is matched, so that where a drive starts does not depend on any policy. It is held
+    to what a lost robot must show. Where the first 200 frames match nothing, nothing will.
+
+    Returns:
+        Number of the frame and the position; None where there is none.
+    """
+    for number, logged in enumerate(frames[:200]):
+        frame = logged.frame
+        if frame.status is not FrameStatus.OK:
+            continue
+        live_id = node_id(live, frame.stamp_ns)
+        found = []
+        for node in opened.graph.nodes:
+            match = matcher.match(frame, live_id, node.id, None)
+            spread = partial(matcher.spread, frame, live_id, node.id, match)
+            if accept_lost(match, spread, acceptance):
+                found.append((match, node.id))
+        if found:
+            match, best = max(found, key=lambda one: (one[0].inliers, one[1].int))
+            assert match.reference_from_live is not None
+            assert match.covariance is not None
+            return number, Position(best, match.reference_from_live, match.covariance)
+    return None
+
+
+class KeptMaps:
+    """The map files requested last, as they were when they were opened; one worker's.
+
+    Args:
+        files: how many are kept, each in all the revisions that were asked for.
+        cache_bytes: how much memory the landmarks of each map may take.
+    """
+
+    def __init__(self, files: int, cache_bytes: int = DEFAULT_CACHE_BYTES) -> None:
+        self._most = files
+        self._cache_bytes = cache_bytes
+        self._files: OrderedDict[tuple[Path, int], dict[int | None, Map]] = OrderedDict()
+
+    def open(self, path: Path, at: int | None = None) -> Map:
+        """A map, of a revision if one is given. It is closed here, once others are requested.
+
+        Raises:
+            MapError: it cannot be read.
+        """
+        # A map that was made anew stands in another file of the same name.
+        file = path, path.stat().st_ino
+        maps = self._files.setdefault(file, {})
+        self._files.move_to_end(file)
+        while len(self._files) > self._most:
+            _close(self._files.popitem(last=False)[1])
+        if at not in maps:
+            maps[at] = Map.open(path, at=at, cache_bytes=self._cache_bytes)
+        return maps[at]
+
+    def close(self) -> None:
+        """Closes them all."""
+        for maps in self._files.values():
+            _close(maps)
+        self._files.clear()
+
+
+def _close(maps: dict[int | None, Map]) -> None:
+    for opened in maps.values():
+        opened.close()

@@ -9,11 +9,13 @@ from typing import Any, TypeAlias
 from engram.cli.settings import AllSettings
 from engram.config import config_hash, to_dict
 from engram.errors import ConfigError
-from engram.frontend import Frontend
-from engram.localiser import METHOD_VERSION, Localiser, Matcher
-from engram.localiser.given import InForce
-from engram.odometry import GapFiller
-from engram.robot import Robot, Settings
+from engram.frontend.frontend import Frontend
+from engram.localiser.attempts import Matcher
+from engram.localiser.localiser import InForce, Localiser
+from engram.localiser.settings import METHOD_VERSION
+from engram.odometry.motion import GapFiller
+from engram.robot.robot import Robot
+from engram.robot.settings import Settings
 from engram_lab.studies.drives import DriveSet, EvaluatedDrive
 
 # Settings by key with its tables, "localiser.recent.T", as plain values.

@@ -1,4 +1,4 @@
-"""What a study leaves in its folder: tidy tables as CSV, and a page in Markdown made from them.
+"""The output folder of a study: tidy tables as CSV, curves, and a page in Markdown.
 
 A row is a dictionary, and a table a list of rows. The page's renderer looks at names of columns
 alone: shares are printed in per cent, and a column with ``_low`` and ``_high`` beside it gets its
@@ -10,14 +10,68 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from engram.measures import Drive
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.errors import InputError, MapLockedError, storage_full
+from engram.files import WriterLock, current_holder
+from engram.measures import Drive, Estimator, failure_sums
 from engram.monitor import write_whole
-from engram_lab.intervals import Resamples, SessionSums, Statistic, difference, not_localised_sums
+from engram_lab.charts import Line
+from engram_lab.intervals import (
+    Interval,
+    Resamples,
+    SessionSums,
+    Statistic,
+    difference,
+    not_localised_sums,
+    product,
+)
 from engram_lab.studies.building import write_json
-from engram_lab.studies.writing import writing
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Turns the file system's errors, in what writes below a folder, into Engram's.
+
+    Raises:
+        StorageFullError: no space is left.
+        InputError: the folder or a file in it cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        where = error.filename or folder
+        if full := storage_full(error, where):
+            raise full from error
+        raise InputError(f"{where}: cannot be written: {error.strerror or error}") from error
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Lets no other run work in a folder meanwhile: they would take each other's drafts away.
+
+    Raises:
+        MapLockedError: another run works there.
+        MapError: the folder cannot be locked.
+    """
+    locked = folder / "run"
+    try:
+        lock = WriterLock(locked)
+    except MapLockedError as error:
+        raise MapLockedError(
+            f"{folder}: {current_holder(locked) or 'another process'} evaluates there; wait until "
+            "it is done, give another --work, or look at what is done with --report-only"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
 
 Row: TypeAlias = dict[str, Any]
 _SHARES = ("share_", "p_gt_", "excess_", "minus_", "expected_missed", "union_", "united_share")
@@ -176,3 +230,49 @@ def _number(value: float) -> str:
         return "–" if math.isnan(value) else "∞"
     digits = 0 if abs(value) >= 1000 else 2
     return f"{value:.{digits}f}".replace("-", "\N{MINUS SIGN}")
+
+
+# Where failure curves are drawn.
+CURVE_AT_M = np.arange(0.0, 50.5, 0.5)
+
+
+def failure_line(
+    label: str,
+    drives: Sequence[Drive],
+    resamples: Resamples,
+    estimator: Estimator = Estimator.ROUTE,
+    *,
+    scaled: bool = False,
+) -> Line:
+    """P(X ≥ x) in per cent.
+
+    Args:
+        label: of the line.
+        drives: one per session.
+        resamples: draws of sessions.
+        estimator: of P.
+        scaled: times the share of the route that is not localised (method §8).
+    """
+    parts = [failure_sums(one, CURVE_AT_M, estimator) for one in drives]
+    below = np.array([part[1] for part in parts])
+    missed = not_localised_sums(drives)
+    sums = [
+        SessionSums(np.array([part[0][k] for part in parts]), below) for k in range(len(CURVE_AT_M))
+    ]
+    bands = [resamples.interval(product(one, missed) if scaled else one) for one in sums]
+    return _banded(label, CURVE_AT_M, bands, marks=False)
+
+
+def row_line(label: str, rows: Sequence[Row], x: Sequence[float], column: str) -> Line:
+    """A column of a table in per cent, with the band that the table has for it."""
+    bands = [
+        Interval(*(row.get(column + end, np.nan) for end in ("", "_low", "_high"))) for row in rows
+    ]
+    return _banded(label, np.array(x, np.float64), bands)
+
+
+def _banded(
+    label: str, x: NDArray[np.float64], bands: Iterable[Interval], *, marks: bool = True
+) -> Line:
+    y, low, high = 100 * np.array([(one.estimate, one.low, one.high) for one in bands]).T
+    return Line(label, x, y, low, high, marks=marks)

@@ -3,46 +3,376 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from engram.errors import InputError
-from engram.robot import Settings
-from engram_lab.intervals import Resamples, SessionSums, excess_ratio, ratio
+from engram.measures import FORMULAS, Estimator
+from engram.robot.settings import Settings
+from engram_lab.charts import Line, Panel, draw_bars, draw_curves
+from engram_lab.intervals import Interval, Resamples, SessionSums, difference, excess_ratio, ratio
 from engram_lab.studies.configurations import (
     EVERYTHING,
     UNLIMITED,
     Configuration,
+    PathKinds,
+    Radius,
     lanes_text,
 )
-from engram_lab.studies.in_force import VARIED, exceptions, in_words, unused
+from engram_lab.studies.in_force import VARIED, columns, exceptions, in_words, unused
 from engram_lab.studies.in_force import rows as in_force_rows
 from engram_lab.studies.pages import (
     COMPARED,
     Row,
     chosen,
     compared,
+    failure_line,
     make_folder,
     pivot,
     plain_table,
     rated,
+    row_line,
     table,
     write_study,
-)
-from engram_lab.studies.ranking_figures import draw_figures
-from engram_lab.studies.ranking_rows import (
-    few_lanes_results,
-    labelled,
-    policy_rows,
-    rows_by_size,
-    session_rows,
-    summary_rows,
 )
 from engram_lab.studies.running import Plan
 from engram_lab.studies.summary import CampaignResult, ConfigurationResult, collect
 from engram_lab.truth import TRUTH_SUFFIX
+
+_AT_M = (5.0, 10.0)
+_USUAL = {"mode": "memo", "fold": "all"}
+
+
+def summary_rows(campaign: CampaignResult) -> list[Row]:
+    """One row per configuration and fold, and one of all folds pooled, with 90 % intervals."""
+    rows = []
+    for mode, results in (("memo", campaign.memo), ("live", campaign.live)):
+        for result in results.values():
+            rows += [
+                _row(campaign, mode, result.of_fold(fold), str(fold))
+                for fold in sorted({one.fold for one in result.sessions})
+            ]
+            pooled = _row(campaign, mode, result, "all")
+            rows.append(pooled | _intervals(campaign, result))
+            if mode == "memo":
+                rows[-1] |= _beside_others(campaign, result)
+    return rows
+
+
+def session_rows(campaign: CampaignResult) -> list[Row]:
+    """One row per configuration and session, in the whole map."""
+    return [
+        {
+            "session": session.session,
+            **_row(
+                campaign,
+                mode,
+                ConfigurationResult(result.configuration, [session]),
+                str(session.fold),
+            ),
+        }
+        for mode, results in (("memo", campaign.memo), ("live", campaign.live))
+        for result in results.values()
+        if result.configuration.sessions is None
+        for session in result.sessions
+    ]
+
+
+def _row(campaign: CampaignResult, mode: str, result: ConfigurationResult, fold: str) -> Row:
+    configuration, errors = result.configuration, result.errors
+    known = len(errors.offset_m) > 0
+    return {
+        "campaign": campaign.name,
+        "policy": configuration.policy,
+        "lanes": configuration.lanes_text,
+        "rounds": configuration.rounds,
+        "T": campaign.T_of(configuration),
+        "radius": configuration.radius.value,
+        "paths": (configuration.paths or campaign.paths).value,
+        "map_sessions": configuration.sessions,
+        "mode": mode,
+        "fold": fold,
+        "sessions": len(result.sessions),
+        "frames": result.frames,
+        "driven_m": float(result.driven_m.sum()),
+        "p_gt_10m": result.failure(10.0).value,
+        "share_not_localised": result.not_localised.value,
+        "attempts_per_frame": result.attempts_per_frame,
+        "ms_per_frame": result.step_ms if mode == "live" else None,
+        "false_successes": result.false_successes,
+        "median_error_m": float(np.median(errors.offset_m)) if known else None,
+        "median_error_deg": float(np.rad2deg(np.median(errors.turn_rad))) if known else None,
+        "successes": result.successes,
+        "p_gt_5m": result.failure(5.0).value,
+        **{
+            f"p_gt_{at_m:.0f}m_{estimator.value}": result.failure(at_m, estimator).value
+            for estimator in (Estimator.GAP, Estimator.LOST)
+            for at_m in _AT_M
+        },
+        "longest_gap_m": result.longest_gap_m,
+        "candidates_per_frame": float(np.mean([one.candidates for one in result.sessions])),
+        "nodes": float(np.mean([one.nodes for one in result.sessions])),
+        "step_ms_without_matching": result.step_ms if mode == "memo" else None,
+        **{name: value for name, value in columns(result.in_force).items() if name != "T"},
+    }
+
+
+def _intervals(campaign: CampaignResult, result: ConfigurationResult) -> Row:
+    resamples = Resamples.of(len(result.sessions), seed=campaign.seed)
+    found: Row = {}
+    for name, sums in (
+        ("p_gt_10m", result.failure(10.0)),
+        ("share_not_localised", result.not_localised),
+    ):
+        interval = resamples.interval(sums)
+        found |= {f"{name}_low": interval.low, f"{name}_high": interval.high}
+    return found
+
+
+def _beside_others(campaign: CampaignResult, result: ConfigurationResult) -> Row:
+    """Excess over the oracle, and the paired difference from `distance`, under the same budget."""
+    mine = result.configuration
+    plain = Configuration("oracle", mine.lanes, mine.rounds, sessions=mine.sessions)
+    bound = campaign.memo.get(plain)
+    nearest = campaign.memo.get(replace(plain, policy="distance"))
+    row: Row = {}
+    if bound is not None:
+        row["excess_not_localised"] = result.not_localised.value - bound.not_localised.value
+        row["excess_p_gt_10m"] = result.failure(10.0).value - bound.failure(10.0).value
+    if nearest is not None:
+        gap = campaign.resamples.interval(difference(result.not_localised, nearest.not_localised))
+        row["minus_distance"] = gap.estimate
+        row |= {"minus_distance_low": gap.low, "minus_distance_high": gap.high}
+    return row
+
+
+def few_lanes_results(campaign: CampaignResult) -> list[ConfigurationResult]:
+    """Every policy, and the variants of the path policies."""
+    found = [campaign.get(policy) for policy in campaign.policies]
+    found += [
+        campaign.get(policy, **variant)
+        for policy in ("path-near", "path")
+        for variant in ({"radius": Radius.BASIN}, {"paths": campaign.paths.other})
+    ]
+    return [one for one in found if one is not None]
+
+
+def labelled(campaign: CampaignResult, rows: Sequence[Row]) -> list[Row]:
+    """The memoised rows of all folds, by what is unusual about them."""
+    labels = {
+        (one.policy, one.radius.value, (one.paths or campaign.paths).value): one.label
+        for one in campaign.memo
+    }
+    return [
+        {**row, "label": labels[row["policy"], row["radius"], row["paths"]]}
+        for row in chosen(rows, campaign=campaign.name, **_USUAL)
+    ]
+
+
+def policy_rows(campaign: CampaignResult, own: Sequence[Row]) -> list[Row]:
+    """All policies at the few lanes, losers too."""
+    timed = {one.policy: result.step_ms for one, result in campaign.live.items()}
+    rows = []
+    for result in few_lanes_results(campaign):
+        one = result.configuration
+        (row,) = chosen(
+            own, label=one.label, lanes=one.lanes_text, rounds=one.rounds, T=campaign.T,
+            map_sessions=None,
+        )  # fmt: skip
+        ms = timed.get(one.policy) if one.label == one.policy else None
+        rows.append({**row, "ms_as_on_a_robot": ms, "beats_distance": _verdict(row)})
+    return rows
+
+
+_VERDICTS = {True: "yes", False: "no", None: "no difference shown"}
+
+
+def _verdict(row: Row) -> str:
+    """Whether a policy misses less of the route than `distance` (method §8)."""
+    if row["label"] == "distance" or "minus_distance" not in row:
+        return ""
+    gap = Interval(*(row[f"minus_distance{end}"] for end in ("", "_low", "_high")))
+    return _VERDICTS[gap.lower]
+
+
+def rows_by_size(campaign: CampaignResult, own: Sequence[Row]) -> list[Row]:
+    """The rows at the few lanes, by the number of sessions in the map ([L15] Fig. 9)."""
+    few = chosen(
+        own, lanes=lanes_text(campaign.few_lanes), rounds=campaign.rounds, T=campaign.T,
+        radius="search", paths=campaign.paths.value,
+    )  # fmt: skip
+    return sorted(few, key=lambda row: row["map_sessions"] or UNLIMITED)
+
+
+# Unlimited lanes stand one step behind the last number.
+_BEYOND = 20.0
+# A policy has one colour in all figures, whichever others are drawn beside it.
+POLICY_COLOURS = {
+    "distance": "C0",
+    "path-near": "C1",
+    "path": "C2",
+    "random": "C3",
+    "oracle": "C4",
+    "time-of-day": "C5",
+    "bag-of-words": "C6",
+    "collaborative": "C7",
+    "nearest-of-each": "C8",
+    "bandit": "C9",
+    "recall": "black",
+}
+_LOOKS = {policy: (colour, "-") for policy, colour in POLICY_COLOURS.items()} | {
+    Configuration("path-near", paths=kinds).label: (POLICY_COLOURS["path-near"], "--")
+    for kinds in PathKinds
+}
+
+
+def draw_figures(out: Path, campaigns: Sequence[CampaignResult], rows: Sequence[Row]) -> list[Path]:
+    """Draws every figure for which results are there; returns the files.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
+    """
+    written: list[Path] = []
+    own = {one.name: labelled(one, rows) for one in campaigns}
+
+    def draw(name: str, panels: Sequence[Panel], title: str) -> None:
+        shown = [panel for panel in panels if panel.lines]
+        if shown:
+            draw_curves(shown, out / name, title, _LOOKS)
+            written.append(out / name)
+
+    few = ", ".join(sorted(set(map(_budget, campaigns))))
+    rounds = ", ".join(sorted({f"Nr = {one.rounds}" for one in campaigns}))
+    memory = ", ".join(sorted({f"T = {one.T}" for one in campaigns}))
+    sizes = [_map_size(one, own[one.name]) for one in campaigns]
+    draw("fig09_map_size.png", sizes, f"failure as the map grows, {few}")
+    draw("fig10_candidates.png", list(map(_lap, campaigns)), "candidates along an ordinary lap")
+    for name, column, label in (
+        ("lanes", "p_gt_10m", "P(no match for > 10 m), %"),
+        ("lanes_not_localised", "share_not_localised", "route not localised, %"),
+        ("lanes_against_distance", "minus_distance", "route not localised less distance's, points"),
+    ):
+        panels = [_lanes(one, own[one.name], column, label) for one in campaigns]
+        title = f"failure against the number of lanes, {rounds}, {memory}"
+        draw(f"fig11_{name}.png", panels, title)
+    for estimator, scaled in (*((one, False) for one in Estimator), (Estimator.LOST, True)):
+        name = f"fig12_curves_{estimator.value}{'_scaled' if scaled else ''}.png"
+        panels = [_curves(c, twice, estimator, scaled) for twice in (1, 2) for c in campaigns]
+        formula = FORMULAS[estimator] + (" · share of route not localised" if scaled else "")
+        draw(name, panels, f"failure curves, {rounds}; P(X ≥ x) = {formula}")
+    swept = [_sensitivity(one, own[one.name]) for one in campaigns]
+    draw("fig13_T.png", swept, f"sensitivity of path-near to T, {few}")
+    for one in campaigns:
+        written += _draw_costs(out, one, own[one.name])
+    return written
+
+
+def _budget(campaign: CampaignResult) -> str:
+    return f"Np = {lanes_text(campaign.few_lanes)}, Nr = {campaign.rounds}"
+
+
+def _lines(rows: Sequence[Row], x: str, column: str) -> list[Line]:
+    """One line per label that has several points."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        found.setdefault(row["label"], []).append(row)
+    return [
+        row_line(label, some, [row[x] for row in some], column)
+        for label, some in found.items()
+        if len(some) > 1 and all(column in row for row in some)
+    ]
+
+
+def _map_size(campaign: CampaignResult, own: Sequence[Row]) -> Panel:
+    """[L15] Fig. 9: P(> 10 m) against nodes, after each training session."""
+    lines = _lines(rows_by_size(campaign, own), "nodes", "p_gt_10m")
+    # The first map, of one drive, misses ten times as much as the next.
+    label = "P(no match for > 10 m), %"
+    return Panel(campaign.name, "nodes in the map", label, lines, least_y=0.1)
+
+
+def _lap(campaign: CampaignResult) -> Panel:
+    """[L15] Fig. 10: |Y| and how many of it could succeed, along one lap."""
+    lap = campaign.lap
+    if lap is None:
+        return Panel(campaign.name, "", "", [])
+    lines = [
+        Line("candidates |Y|", lap.driven_m, lap.candidates.astype(np.float64), marks=False),
+        Line("that match", lap.driven_m, lap.succeeded.astype(np.float64), marks=False),
+    ]
+    return Panel(f"{campaign.name}, {lap.name}", "driven, m", "nodes", lines)
+
+
+def _lanes(campaign: CampaignResult, own: Sequence[Row], column: str, label: str) -> Panel:
+    """[L15] Fig. 11: failure against Np; differences are paired."""
+    swept = chosen(own, rounds=campaign.rounds, T=campaign.T, radius="search", map_sessions=None)
+    if column == "minus_distance":
+        swept = chosen(swept, paths=campaign.paths.value)
+    placed = [{**row, "x": _place(row["lanes"])} for row in swept]
+    placed.sort(key=lambda row: row["x"])
+    lines = [
+        replace(one, loose_end=bool(one.x[-1] == _BEYOND)) for one in _lines(placed, "x", column)
+    ]
+    places = sorted({float(x) for line in lines for x in line.x})
+    ticks = [(x, "∞" if x == _BEYOND else f"{x:.0f}") for x in places]
+    signed = column == "minus_distance"
+    return Panel(campaign.name, "Np", label, lines, ticks, signed=signed)
+
+
+def _place(lanes: str) -> float:
+    return _BEYOND if lanes == lanes_text(UNLIMITED) else float(lanes)
+
+
+def _curves(campaign: CampaignResult, twice: int, estimator: Estimator, scaled: bool) -> Panel:
+    """[L15] Fig. 12: P(X ≥ x), under the few lanes or twice as many."""
+    lanes = twice * campaign.few_lanes
+    results = [campaign.get(policy, lanes) for policy in campaign.policies]
+    lines = [
+        failure_line(
+            one.configuration.policy, one.drives, campaign.resamples, estimator, scaled=scaled
+        )
+        for one in results
+        if one is not None
+    ]
+    title = f"{campaign.name}, Np = {lanes_text(lanes)}"
+    return Panel(title, "x, m", "P(X ≥ x), %", lines, least_y=0.01)
+
+
+def _sensitivity(campaign: CampaignResult, own: Sequence[Row]) -> Panel:
+    """[L15] Fig. 13: T."""
+    lanes = lanes_text(campaign.few_lanes)
+    some = chosen(own, label="path-near", lanes=lanes, rounds=campaign.rounds, map_sessions=None)
+    some.sort(key=lambda row: row["T"])
+    places = list(range(len(some)))
+    ticks = [(float(x), str(row["T"])) for x, row in zip(places, some, strict=True)]
+    columns = {"P(> 10 m)": "p_gt_10m", "route not localised": "share_not_localised"}
+    if len(some) < 2:  # path-near was not run, or with one T
+        return Panel(campaign.name, "T", "%", [], ticks)
+    lines = [row_line(label, some, places, column) for label, column in columns.items()]
+    return Panel(campaign.name, "T", "%", lines, ticks)
+
+
+def _draw_costs(out: Path, campaign: CampaignResult, own: Sequence[Row]) -> list[Path]:
+    """Attempts, time, false successes and pose errors of all policies at the few lanes."""
+    rows = [row for row in policy_rows(campaign, own) if row["label"] == row["policy"]]
+    if not rows:
+        return []
+    bars = []
+    for title, column, scale in (
+        ("attempts per frame", "attempts_per_frame", 1.0),
+        ("ms per frame (guided, no memo)", "ms_as_on_a_robot", 1.0),
+        ("false successes", "false_successes", 1.0),
+        ("median error, cm", "median_error_m", 100.0),
+    ):
+        known = [(row["policy"], scale * row[column]) for row in rows if row[column] is not None]
+        if known:
+            bars.append((title, known))
+    path = out / f"costs_{campaign.name}.png"
+    draw_bars(bars, path, f"{campaign.name}, {_budget(campaign)}")
+    return [path]
+
 
 # Shares as low as this differ by less than anyone would notice: added to both sides of ratios to
 # the oracle.

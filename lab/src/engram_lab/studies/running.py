@@ -9,12 +9,12 @@ from pathlib import Path
 
 from engram.config import to_dict
 from engram.errors import ConfigError
-from engram.localiser import Matcher
-from engram.maps import Map, open_map
+from engram.localiser.attempts import FrameMatcher, Matcher
+from engram.maps.map import Map, open_map
 from engram.monitor import QUIET, Monitor
-from engram.ranking import policy_named
-from engram.robot import RobotOptions, Settings
-from engram.sequences import LoggedFrame
+from engram.ranking.policies import policy_named
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.sequence import LoggedFrame
 from engram_lab.policies import STUDIED
 from engram_lab.studies.building import (
     GENEROUS,
@@ -22,6 +22,7 @@ from engram_lab.studies.building import (
     build_map,
     read_built_map,
     read_record,
+    true_nodes,
 )
 from engram_lab.studies.configurations import (
     DEFAULT_LANES,
@@ -30,16 +31,66 @@ from engram_lab.studies.configurations import (
     map_sizes,
     sweep,
 )
-from engram_lab.studies.drives import DriveSet
-from engram_lab.studies.folds import Fold
-from engram_lab.studies.held_out import localise_held_out
+from engram_lab.studies.drives import DriveSet, EvaluatedDrive, Fold, KeptMaps, start_by_matching
 from engram_lab.studies.in_force import check_logs, check_lost
-from engram_lab.studies.kept_maps import KeptMaps
-from engram_lab.studies.lockstep import Runs
-from engram_lab.studies.memo import MatchMemo
-from engram_lab.studies.plan import StudyOptions, StudyPlan, all_tables, study_folder
-from engram_lab.studies.store import joined, missing, only, read_runs, write_runs
-from engram_lab.studies.tasks import Task
+from engram_lab.studies.lockstep import (
+    MatchMemo,
+    Runs,
+    Situation,
+    joined,
+    missing,
+    only,
+    read_runs,
+    run_in_step,
+    write_runs,
+)
+from engram_lab.studies.plan import StudyOptions, StudyPlan, Task, all_tables, study_folder
+
+
+def localise_held_out(
+    opened: Map,
+    drive: EvaluatedDrive,
+    frames: Sequence[LoggedFrame],
+    training: Sequence[EvaluatedDrive],
+    configurations: Sequence[Configuration],
+    settings: Settings,
+    matcher: Matcher | None,
+    relocaliser: str | None,
+    threads: int | None = None,
+) -> Runs:
+    """Localises a drive with every configuration, from the node nearest by truth.
+
+    Where truth is not known, its own or that of every node, it starts at its first frame that
+    matches any node.
+
+    Args:
+        opened: the map; it stays as it is.
+        drive: the drive, which is not in it.
+        frames: of the drive.
+        training: at least the drives that the map was built from.
+        configurations: what to run.
+        settings: the resolved configuration.
+        matcher: makes the matches, unguided; None for the localiser's own, guided ones.
+        relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near.
+        threads: most threads that a robot's lanes share; None for one each.
+    """
+    nodes, truth = true_nodes(opened, training), drive.truth()
+    first = None if truth is None else truth.at(frames[0].frame.stamp_ns)
+    position = None if first is None else nodes.start(first)
+    start = None if position is None else (0, position)
+    if start is None:
+        config = settings.localiser
+        start = start_by_matching(
+            opened,
+            frames,
+            drive.session.id,
+            FrameMatcher(opened.frames, config.matcher) if matcher is None else matcher,
+            config.acceptance,
+        )
+    situation = Situation(opened, drive, frames, start, nodes, truth)
+    cost = (lambda: matcher.seconds) if isinstance(matcher, MatchMemo) else (lambda: 0.0)
+    return run_in_step(situation, configurations, settings, matcher, relocaliser, cost, threads)
+
 
 # Policies that cannot run without knowing the outcomes.
 _BOUNDS = ("oracle",)

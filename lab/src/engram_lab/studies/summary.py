@@ -15,25 +15,14 @@ from engram.cli.settings import AllSettings
 from engram.errors import InputError
 from engram.measures import Drive, Estimator, failure_sums, longest_gap_m
 from engram_lab.accuracy import PoseErrors
-from engram_lab.intervals import (
-    Resamples,
-    SessionSums,
-    not_localised_sums,
-)
+from engram_lab.intervals import Resamples, SessionSums, not_localised_sums
 from engram_lab.policies import STUDIED
 from engram_lab.studies.building import BuiltMap
-from engram_lab.studies.configurations import (
-    EVERYTHING,
-    Configuration,
-    PathKinds,
-    map_sizes,
-    sweep,
-)
-from engram_lab.studies.folds import Fold
+from engram_lab.studies.configurations import EVERYTHING, Configuration, PathKinds, map_sizes, sweep
+from engram_lab.studies.drives import Fold
 from engram_lab.studies.in_force import VARIED, Values, common
-from engram_lab.studies.lockstep import Runs
+from engram_lab.studies.lockstep import Runs, read_runs
 from engram_lab.studies.running import Plan, built_map
-from engram_lab.studies.store import read_runs
 
 Array = NDArray[np.float64]
 

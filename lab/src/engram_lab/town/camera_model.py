@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram_lab import _town
-from engram_lab.town.drive import Pose
-from engram_lab.town.robots import Robot
+from engram_lab.town.drive import Pose, Robot
 
 Luminance = NDArray[np.float32]
 Grey = NDArray[np.uint8]

@@ -1,17 +1,24 @@
-"""What stands in the street: lamps, trees, hedges, signs, fences, benches, stalls."""
+"""What stands and drives in the street: furniture, trees, vehicles, people, buildings.
+
+Cars, vans, cyclists and pedestrians as small meshes around their own origin. Each stands on z = 0
+and faces east (+x); `Mesh.moved` puts it in its place.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from engram_lab import _town
-from engram_lab.town.mesh import Kind, MeshBuilder, SurfaceFlag
-from engram_lab.town.noise import NoiseFields
+from engram_lab.town.mesh import Kind, Mesh, MeshBuilder, SurfaceFlag
 from engram_lab.town.textures import (
+    Facade,
+    NoiseFields,
+    Opening,
     Style,
     Texels,
     grass,
@@ -354,3 +361,474 @@ def add_stall(
         Kind.TEMPORARY,
         SurfaceFlag.TWO_SIDED,
     )
+
+
+# Profiles from the front bumper over the roof to the rear: (x, z) in metres, and whether the
+# segment that starts there is glass.
+_SALOON = (
+    (2.15, 0.35, False), (2.2, 0.62, False), (1.15, 0.88, True), (0.35, 1.38, False),
+    (-0.95, 1.42, True), (-1.6, 0.98, False), (-2.15, 0.92, False), (-2.2, 0.4, False),
+)  # fmt: skip
+_HATCH = (
+    (1.85, 0.35, False), (1.9, 0.66, False), (1.05, 0.92, True), (0.35, 1.45, False),
+    (-1.2, 1.5, True), (-1.75, 0.98, False), (-1.85, 0.9, False), (-1.85, 0.4, False),
+)  # fmt: skip
+_VAN = (
+    (2.4, 0.4, False), (2.45, 0.95, False), (1.9, 1.15, True), (1.35, 1.95, False),
+    (-2.3, 2.05, False), (-2.4, 1.0, False), (-2.4, 0.7, False), (-2.4, 0.45, False),
+)  # fmt: skip
+_SQUARE = [(0, 1), (1, 1), (1, 0), (0, 0)]
+
+
+def car(materials: Materials, rng: np.random.Generator, kind: Kind = Kind.PARKED) -> Mesh:
+    """A saloon, hatchback or van in one of the paints."""
+    builder = MeshBuilder()
+    profile = (_SALOON, _HATCH, _HATCH, _VAN)[int(rng.integers(4))]
+    stretch, rise = rng.uniform(0.92, 1.08), rng.uniform(0.95, 1.08)
+    paint = materials.paints[int(rng.integers(len(materials.paints)))]
+    tint = float(rng.uniform(0.85, 1.2))
+    points = [(x * stretch, z * rise) for x, z, _ in profile]
+    waist = max(points[2][1], points[5][1])
+    lean = 0.07 if profile is _VAN else 0.22
+
+    def half_width(z: float) -> float:
+        return 0.86 - max(0.0, z - waist) * lean  # the cabin leans in
+
+    for k in range(len(points) - 1):
+        (x0, z0), (x1, z1) = points[k], points[k + 1]
+        a, b = half_width(z0), half_width(z1)
+        corners = [(x0, -a, z0), (x0, a, z0), (x1, b, z1), (x1, -b, z1)]
+        material, flags = (
+            (materials.glass, SurfaceFlag.GLASS) if profile[k][2] else (paint, SurfaceFlag.PLAIN)
+        )
+        builder.quad(corners, _SQUARE, material, kind, flags, 1.0 if profile[k][2] else tint)
+    _add_sides(builder, materials, points, half_width(points[3][1]), paint, tint, kind, waist)
+    _add_wheels(builder, materials, points, kind)
+    _add_lights(builder, materials, points, kind, rng)
+    return builder.build()
+
+
+def _add_sides(
+    builder: MeshBuilder,
+    materials: Materials,
+    points: list[tuple[float, float]],
+    roof_half_m: float,
+    paint: int,
+    tint: float,
+    kind: Kind,
+    waist: float,
+) -> None:
+    front, nose, screen, roof, back, boot, tail, rear = points
+    for side in (-1.0, 1.0):
+
+        def put(
+            outline: list[tuple[float, float, float]],
+            texture: int,
+            flags: SurfaceFlag,
+            side: float = side,
+        ) -> None:
+            corners = [(x, side * y, z) for x, y, z in outline]
+            order = corners if side < 0 else corners[::-1]
+            builder.quad(order, _SQUARE, texture, kind, flags, tint if texture == paint else 1.0)
+
+        low = min(front[1], rear[1])
+        body = 0.86
+        # From the rear to the front, seen from the right-hand side (y < 0).
+        put(
+            [
+                (rear[0], body, low),
+                (front[0], body, low),
+                (nose[0], body, nose[1]),
+                (tail[0], body, tail[1]),
+            ],
+            paint,
+            SurfaceFlag.PLAIN,
+        )
+        put(
+            [
+                (tail[0], body, tail[1]),
+                (nose[0], body, nose[1]),
+                (screen[0], body, screen[1]),
+                (boot[0], body, boot[1]),
+            ],
+            paint,
+            SurfaceFlag.PLAIN,
+        )
+        cabin = [
+            (boot[0], body, boot[1]), (screen[0], body, screen[1]),
+            (roof[0], roof_half_m, roof[1]), (back[0], roof_half_m, back[1]),
+        ]  # fmt: skip
+        put(cabin, paint, SurfaceFlag.PLAIN)
+        if back[0] < -2:  # a van: only the door has a window
+            put(
+                [(0.75, 0.85, waist), (1.55, 0.85, waist), (1.25, 0.74, 1.75), (0.8, 0.74, 1.75)],
+                materials.glass,
+                SurfaceFlag.GLASS,
+            )
+            continue
+        middle = np.mean(cabin, axis=0)
+        for share in (0.0, 1.0):  # two windows, a little outside the paint
+            window = [np.asarray(p) * 0.86 + middle * 0.14 for p in cabin]
+            half_low = (window[0] + window[1]) / 2
+            half_high = (window[2] + window[3]) / 2
+            gap = np.array([0.05, 0, 0])
+            pane = (
+                [window[0], half_low - gap, half_high - gap, window[3]]
+                if share == 0
+                else [half_low + gap, window[1], window[2], half_high + gap]
+            )
+            put(
+                [(float(p[0]), float(p[1]) + 0.02, float(p[2])) for p in pane],
+                materials.glass,
+                SurfaceFlag.GLASS,
+            )
+
+
+def _add_wheels(
+    builder: MeshBuilder, materials: Materials, points: list[tuple[float, float]], kind: Kind
+) -> None:
+    low = min(points[0][1], points[7][1])
+    # A dark floor keeps the light from shining through below.
+    floor = [(points[7][0], 0.8, 0.2), (points[0][0], 0.8, 0.2)]
+    floor += [(points[0][0], -0.8, 0.2), (points[7][0], -0.8, 0.2)]
+    builder.quad(floor, _SQUARE, materials.rubber, kind, SurfaceFlag.TWO_SIDED)
+    for side in (-1.0, 1.0):
+        skirt = [(points[7][0], side * 0.8, 0.2), (points[0][0], side * 0.8, 0.2)]
+        skirt += [(points[0][0], side * 0.86, low), (points[7][0], side * 0.86, low)]
+        order = skirt if side < 0 else skirt[::-1]
+        builder.quad(order, _SQUARE, materials.rubber, kind, SurfaceFlag.TWO_SIDED)
+    for end in (points[0][0], points[7][0]):
+        apron = [(end, -0.8, 0.2), (end, 0.8, 0.2), (end, 0.86, low), (end, -0.86, low)]
+        builder.quad(apron, _SQUARE, materials.rubber, kind, SurfaceFlag.TWO_SIDED)
+    for x in (points[0][0] * 0.64, points[7][0] * 0.64):
+        for side in (-1.0, 1.0):
+            add_wheel(builder, materials, (x, side * 0.885, 0.31), 0.31, kind)
+            add_wheel(builder, materials, (x, side * 0.89, 0.31), 0.17, kind, materials.metal)
+
+
+def add_wheel(
+    builder: MeshBuilder,
+    materials: Materials,
+    centre: tuple[float, float, float],
+    radius_m: float,
+    kind: Kind,
+    texture: int | None = None,
+) -> None:
+    """A disc across y, as three quads of an octagon, seen from both sides."""
+    angle = np.pi / 8 + np.arange(8) * np.pi / 4
+    rim = np.stack(
+        [
+            centre[0] + radius_m * np.cos(angle),
+            np.full(8, centre[1]),
+            centre[2] + radius_m * np.sin(angle),
+        ],
+        axis=1,
+    )
+    for a, b, c, d in ((0, 1, 2, 3), (0, 3, 4, 7), (4, 5, 6, 7)):
+        builder.quad(
+            rim[[a, b, c, d]],
+            _SQUARE,
+            materials.rubber if texture is None else texture,
+            kind,
+            SurfaceFlag.TWO_SIDED,
+        )
+
+
+def _add_lights(
+    builder: MeshBuilder,
+    materials: Materials,
+    points: list[tuple[float, float]],
+    kind: Kind,
+    rng: np.random.Generator,
+) -> None:
+    on = 1.0 if kind is Kind.MOVING else 0.0
+    nose, tail = points[1], points[6]
+    for side in (-1.0, 1.0):
+        x = nose[0] + 0.015
+        light = [(x, side * 0.62 - 0.14, 0.5), (x, side * 0.62 + 0.14, 0.5)]
+        light += [(x, side * 0.62 + 0.14, 0.64), (x, side * 0.62 - 0.14, 0.64)]
+        builder.quad(light, _SQUARE, materials.light, kind, SurfaceFlag.GLASS, 0.7, 9.0 * on)
+        x = tail[0] - 0.06
+        light = [(x, side * 0.68 + 0.12, 0.68), (x, side * 0.68 - 0.12, 0.68)]
+        light += [(x, side * 0.68 - 0.12, 0.84), (x, side * 0.68 + 0.12, 0.84)]
+        builder.quad(light, _SQUARE, materials.light, kind, SurfaceFlag.GLASS, 0.25, 1.2 * on)
+    plate_texture = materials.plates[int(rng.integers(len(materials.plates)))]
+    for x, turn in ((points[0][0] + 0.06, 1.0), (points[7][0] - 0.06, -1.0)):
+        plate = [
+            (x, -0.26 * turn, 0.42),
+            (x, 0.26 * turn, 0.42),
+            (x, 0.26 * turn, 0.53),
+            (x, -0.26 * turn, 0.53),
+        ]
+        builder.quad(plate, _SQUARE, plate_texture, kind)
+
+
+def pedestrian(materials: Materials, rng: np.random.Generator, stride: float = 0.0) -> Mesh:
+    """A person of boxes; stride −1…1 swings legs and arms."""
+    builder = MeshBuilder()
+    tall = rng.uniform(0.92, 1.08)
+    coat = materials.paints[int(rng.integers(len(materials.paints)))]
+    legs = materials.paints[int(rng.integers(3))]
+
+    def limb(
+        at: tuple[float, float, float],
+        half: tuple[float, float, float],
+        texture: int,
+        lean: float = 0.0,
+    ) -> None:
+        s, c = np.sin(lean), np.cos(lean)
+        axes = np.array(
+            [[half[0] * c, 0, -half[0] * s], [0, half[1], 0], [half[2] * s, 0, half[2] * c]]
+        )
+        builder.box(
+            np.array(at) * tall, axes * tall, texture, Kind.MOVING, per_m=0.6, faces="ewnstd"
+        )
+
+    for side in (-1.0, 1.0):
+        swing = 0.45 * stride * side
+        limb((0.4 * np.sin(-swing) * 0.5, side * 0.09, 0.43), (0.075, 0.07, 0.43), legs, -swing)
+        limb((0.3 * np.sin(swing) * 0.5, side * 0.25, 1.13), (0.05, 0.05, 0.31), coat, swing)
+    limb((0, 0, 1.15), (0.12, 0.19, 0.31), coat)
+    limb((0.01, 0, 1.6), (0.1, 0.085, 0.13), materials.stone)
+    return builder.build()
+
+
+def cyclist(materials: Materials, rng: np.random.Generator) -> Mesh:
+    """A rider on a bicycle."""
+    builder = MeshBuilder()
+    for x in (-0.52, 0.52):
+        add_wheel(builder, materials, (x, 0.0, 0.34), 0.34, Kind.MOVING)
+        add_wheel(builder, materials, (x, 0.012, 0.34), 0.29, Kind.MOVING, materials.metal)
+        add_wheel(builder, materials, (x, -0.012, 0.34), 0.29, Kind.MOVING, materials.metal)
+    for at, half in (
+        ((0, 0, 0.62), (0.42, 0.025, 0.03)),
+        ((-0.15, 0, 0.75), (0.02, 0.02, 0.2)),
+        ((0.45, 0, 0.8), (0.02, 0.22, 0.25)),
+    ):
+        builder.box(np.array(at), np.diag(half), materials.metal, Kind.MOVING, faces="ewnst")
+    rider = pedestrian(materials, rng, 0.8)
+    lifted = rider.moved((-0.1, 0.0, 0.18), 0.0)
+    return Mesh.joined([builder.build(), lifted])
+
+
+RECESS_M = 0.16  # of panes and doors behind the wall
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Front:
+    """The vertical plane of a front.
+
+    Attributes:
+        corner: (3,) its lower left corner seen from the street, metres.
+        along: (3,) unit vector to the right, level.
+        texture: number of the facade's texture.
+        stone: number of a generic texture for sills and the like.
+        tint: factor on the albedo.
+    """
+
+    corner: Vector
+    along: Vector
+    texture: int
+    stone: int
+    tint: float
+
+    @property
+    def outwards(self) -> Vector:
+        """Unit vector (3,) towards the street."""
+        return np.array([self.along[1], -self.along[0], 0.0])
+
+    def at(self, u_m: float, z_m: float, out_m: float = 0.0) -> Vector:
+        """The point u to the right, z above the ground and so far out of the wall."""
+        return self.corner + self.along * u_m + _UP * z_m + self.outwards * out_m
+
+    def rectangle(self, u0: float, u1: float, z0: float, z1: float, out_m: float) -> list[Vector]:
+        """Four corners, anticlockwise seen from the street."""
+        return [self.at(u, z, out_m) for u, z in ((u0, z0), (u1, z0), (u1, z1), (u0, z1))]
+
+
+def add_front(builder: MeshBuilder, front: Front, facade: Facade, rng: np.random.Generator) -> None:
+    """A wall with holes, panes set back in them, reveals, and relief that stands out."""
+    width, height = facade.width_m, facade.height_m
+
+    def uv(u0: float, u1: float, z0: float, z1: float) -> list[tuple[float, float]]:
+        low, high = 1 - z0 / height, 1 - z1 / height
+        return [(u0 / width, low), (u1 / width, low), (u1 / width, high), (u0 / width, high)]
+
+    def put(u0: float, u1: float, z0: float, z1: float, out_m: float, glow: float) -> None:
+        flags = SurfaceFlag.GLASS if out_m < 0 else SurfaceFlag.PLAIN
+        builder.quad(
+            front.rectangle(u0, u1, z0, z1, out_m),
+            uv(u0, u1, z0, z1),
+            front.texture,
+            Kind.BUILDING,
+            flags,
+            front.tint,
+            glow,
+        )
+
+    for u0, u1, z0, z1 in wall_pieces(width, height, facade.openings):
+        put(u0, u1, z0, z1, 0.0, 0.0)
+    for opening in facade.openings:
+        lit = rng.uniform(0.3, 1.0) if rng.random() < (0.6 if opening.is_shop else 0.35) else 0.0
+        bounds = (opening.left_m, opening.right_m, opening.bottom_m, opening.top_m)
+        put(*bounds, -RECESS_M, lit)
+        _add_reveals(builder, front, opening)
+        _add_relief(builder, front, opening, rng)
+    # Behind the wall, so that a crack between two pieces shows wall and no sky.
+    put(0, width, 0, height, -RECESS_M - 0.05, 0.0)
+    _add_courses(builder, front, facade, rng)
+
+
+def wall_pieces(
+    width_m: float, height_m: float, openings: tuple[Opening, ...]
+) -> list[tuple[float, float, float, float]]:
+    """Rectangles (left, right, bottom, top) that cover a wall except its openings."""
+    levels = sorted({0.0, height_m, *(o.bottom_m for o in openings), *(o.top_m for o in openings)})
+    pieces = []
+    for bottom, top in pairwise(levels):
+        cuts = sorted(
+            (o.left_m, o.right_m) for o in openings if o.bottom_m <= bottom and o.top_m >= top
+        )
+        left = 0.0
+        for start, end in cuts:
+            if start > left:
+                pieces.append((left, start, bottom, top))
+            left = max(left, end)
+        if left < width_m:
+            pieces.append((left, width_m, bottom, top))
+    return pieces
+
+
+def _add_reveals(builder: MeshBuilder, front: Front, opening: Opening) -> None:
+    u0, u1, z0, z1 = opening.left_m, opening.right_m, opening.bottom_m, opening.top_m
+    deep = -RECESS_M
+    sides = [
+        ((u0, z0, 0), (u0, z0, deep), (u0, z1, deep), (u0, z1, 0)),
+        ((u1, z0, deep), (u1, z0, 0), (u1, z1, 0), (u1, z1, deep)),
+        ((u0, z0, 0), (u1, z0, 0), (u1, z0, deep), (u0, z0, deep)),
+        ((u0, z1, deep), (u1, z1, deep), (u1, z1, 0), (u0, z1, 0)),
+    ]
+    for corners in sides:
+        long = max(u1 - u0, z1 - z0) * 0.25
+        builder.quad(
+            [front.at(*corner) for corner in corners],
+            [(0, 0.04), (long, 0.04), (long, 0), (0, 0)]
+            if corners[0][2] == corners[1][2]
+            else [(0, long), (0.04, long), (0.04, 0), (0, 0)],
+            front.stone,
+            Kind.BUILDING,
+            SurfaceFlag.TWO_SIDED,
+        )
+
+
+def _slab(
+    builder: MeshBuilder,
+    front: Front,
+    bounds: tuple[float, float, float, float],
+    out_m: float,
+    faces: str = "ewstd",
+    tint: float = 1.0,
+) -> None:
+    """A box on the wall: bounds (left, right, bottom, top), standing out so far."""
+    u0, u1, z0, z1 = bounds
+    centre = front.at((u0 + u1) / 2, (z0 + z1) / 2, out_m / 2)
+    axes = [
+        front.along * (u1 - u0) / 2,
+        -front.outwards * out_m / 2,
+        _UP * (z1 - z0) / 2,
+    ]
+    builder.box(centre, axes, front.stone, Kind.BUILDING, faces=faces, tint=tint)
+
+
+def _add_relief(
+    builder: MeshBuilder, front: Front, opening: Opening, rng: np.random.Generator
+) -> None:
+    u0, u1, z0, z1 = opening.left_m, opening.right_m, opening.bottom_m, opening.top_m
+    if opening.is_door:
+        _slab(builder, front, (u0 - 0.1, u1 + 0.1, 0, 0.12), 0.35, "ewst")
+        if rng.random() < 0.4:
+            _slab(builder, front, (u0 - 0.3, u1 + 0.3, z1 + 0.15, z1 + 0.25), 0.7)
+        return
+    if opening.is_shop:
+        _slab(builder, front, (u0 - 0.12, u1 + 0.12, 2.6, 2.74), 0.22)
+        return
+    _slab(builder, front, (u0 - 0.12, u1 + 0.12, z0 - 0.13, z0 - 0.01), 0.2)
+    if rng.random() < 0.5:
+        _slab(builder, front, (u0 - 0.1, u1 + 0.1, z1 + 0.05, z1 + 0.2), 0.14)
+    if z0 > 3.5 and rng.random() < 0.13:
+        _add_balcony(builder, front, opening)
+
+
+def _add_balcony(builder: MeshBuilder, front: Front, opening: Opening) -> None:
+    u0, u1, z0 = opening.left_m - 0.35, opening.right_m + 0.35, opening.bottom_m - 0.3
+    _slab(builder, front, (u0, u1, z0, z0 + 0.14), 0.85)
+    for k in range(6):
+        u = u0 + 0.03 + (u1 - u0 - 0.06) * k / 5
+        bar = (u - 0.02, u + 0.02, z0 + 0.14, z0 + 1.0)
+        centre = front.at(u, (bar[2] + bar[3]) / 2, 0.82)
+        axes = [front.along * 0.02, -front.outwards * 0.02, _UP * 0.43]
+        builder.box(centre, axes, front.stone, Kind.BUILDING, faces="ews", tint=0.3)
+    rail = front.at((u0 + u1) / 2, z0 + 1.02, 0.82)
+    axes = [front.along * (u1 - u0) / 2, -front.outwards * 0.03, _UP * 0.03]
+    builder.box(rail, axes, front.stone, Kind.BUILDING, faces="ewstd", tint=0.3)
+
+
+def _add_courses(
+    builder: MeshBuilder, front: Front, facade: Facade, rng: np.random.Generator
+) -> None:
+    width, height = facade.width_m, facade.height_m
+    _slab(builder, front, (-0.02, width + 0.02, height - 0.42, height - 0.04), 0.32)
+    if rng.random() < 0.7:
+        _slab(builder, front, (0, width, 3.46, 3.62), 0.12)
+    if rng.random() < 0.6:  # downpipe
+        u = 0.25 if rng.random() < 0.5 else width - 0.25
+        _slab(builder, front, (u - 0.05, u + 0.05, 0.1, height - 0.42), 0.12, "ews", 0.6)
+
+
+def add_shell(
+    builder: MeshBuilder,
+    front: Front,
+    width_m: float,
+    height_m: float,
+    depth_m: float,
+    roof: int,
+    rng: np.random.Generator,
+    slides_m: tuple[float, float] = (0.0, 0.0),
+) -> None:
+    """Side and back walls, and a roof: flat, or with its ridge along the street.
+
+    `slides_m` moves the left and the right end of the back wall along the front, for houses round
+    whose corner the fronts of another street begin.
+    """
+    out = front.outwards
+
+    def wall(a: Vector, b: Vector, top_m: float) -> None:
+        long, tall = float(np.linalg.norm(b - a)) * 0.25, top_m * 0.25
+        corners = [a, b, b + _UP * top_m, a + _UP * top_m]
+        uv = [(0, tall), (long, tall), (long, 0), (0, 0)]
+        builder.quad(corners, uv, front.stone, Kind.BUILDING, tint=front.tint)
+
+    left, right = front.at(0, 0), front.at(width_m, 0)
+    back_left = left - out * depth_m + front.along * slides_m[0]
+    back_right = right - out * depth_m + front.along * slides_m[1]
+    wall(right, back_right, height_m)
+    wall(back_right, back_left, height_m)
+    wall(back_left, left, height_m)
+    eaves = [point + _UP * height_m for point in (left, right, back_right, back_left)]
+    if rng.random() < 0.35:
+        tiles = [(0, depth_m / 4), (width_m / 4, depth_m / 4), (width_m / 4, 0), (0, 0)]
+        builder.quad(eaves, tiles, roof, Kind.BUILDING)
+        return
+    rise = rng.uniform(1.8, 3.2)
+    ridge = [(eaves[0] + eaves[3]) / 2 + _UP * rise, (eaves[1] + eaves[2]) / 2 + _UP * rise]
+    slope = float(np.hypot(depth_m / 2, rise)) / 4
+    tiles = [(0, slope), (width_m / 4, slope), (width_m / 4, 0), (0, 0)]
+    builder.quad([eaves[0], eaves[1], ridge[1], ridge[0]], tiles, roof, Kind.BUILDING)
+    builder.quad([eaves[2], eaves[3], ridge[0], ridge[1]], tiles, roof, Kind.BUILDING)
+    for a, b, top in ((eaves[1], eaves[2], ridge[1]), (eaves[3], eaves[0], ridge[0])):
+        uv = [(0, rise / 4), (depth_m / 4, rise / 4), (depth_m / 8, 0), (depth_m / 8, 0)]
+        builder.quad([a, b, top, top], uv, front.stone, Kind.BUILDING, tint=front.tint)
+    chimney = (ridge[0] + ridge[1]) / 2 + rng.uniform(-0.3, 0.3) * (ridge[1] - ridge[0])
+    axes = [front.along * 0.3, -out * 0.3, _UP * 0.8]
+    builder.box(chimney, axes, front.stone, Kind.BUILDING)

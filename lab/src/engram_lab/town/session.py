@@ -8,21 +8,21 @@ from functools import lru_cache
 import numpy as np
 
 from engram.errors import ConfigError
-from engram.frontend import StereoPair
-from engram.geometry import SE3, StereoCamera
+from engram.frontend.frame import StereoPair
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+from engram.graph.model import Clock
+from engram.sequences.motion import Trajectory
+from engram.sequences.sequence import SequenceInfo
 from engram_lab.town.camera_model import CameraModel
 from engram_lab.town.campaigns import Campaign, SessionPlan
-from engram_lab.town.changes import alterations_on
 from engram_lab.town.conditions import Conditions
-from engram_lab.town.drive import DrivingStyle, Line, Pose, drive, driving_line
-from engram_lab.town.life import Life
-from engram_lab.town.mesh import Mesh
+from engram_lab.town.drive import DrivingStyle, Line, Pose, Robot, drive, driving_line, robot_named
+from engram_lab.town.mesh import FrameTruth, Mesh
 from engram_lab.town.rendering import TownRenderer
-from engram_lab.town.robots import Robot, robot_named
-from engram_lab.town.streets import Route, StreetPlan
+from engram_lab.town.streets import Route, StreetPlan, alterations_on
 from engram_lab.town.textures import Style
-from engram_lab.town.town import Today, Town
-from engram_lab.town.truth import FrameTruth
+from engram_lab.town.town import Life, Today, Town
 
 _MOST_THREADS = 256  # of the core
 
@@ -136,3 +136,60 @@ class SimulatedDrive:
 def _town(streets: StreetPlan, route: Route) -> Town:
     """Towns are costly to begin; the sessions of a campaign share one."""
     return Town(streets, route, Style())
+
+
+class SimulatedSequence:
+    """Renders as it is read: a `StereoSequence`.
+
+    Args:
+        campaign: the campaign.
+        session: which of its drives.
+        threads: of the renderer.
+
+    Raises:
+        ConfigError: the campaign has no such session.
+    """
+
+    def __init__(self, campaign: Campaign, session: int, threads: int = 1) -> None:
+        self._drive = SimulatedDrive(campaign, session, threads)
+
+    @property
+    def drive(self) -> SimulatedDrive:
+        """The drive itself, with its truth."""
+        return self._drive
+
+    @property
+    def info(self) -> SequenceInfo:
+        """Facts about the drive as a whole; campaign and seed are part of the robot's name.
+
+        They stand for the robot's identity (method §2.7): wildcats of two towns are two robots.
+        """
+        campaign, plan = self._drive.campaign, self._drive.plan
+        return SequenceInfo(
+            name=plan.name,
+            format="simulated",
+            clock=Clock.UTC,
+            robot=f"{plan.robot}@{campaign.home}-{campaign.seed}",
+            longitude_deg=campaign.place.longitude_deg,
+        )
+
+    @property
+    def camera(self) -> StereoCamera:
+        """The robot's camera."""
+        return self._drive.camera
+
+    @property
+    def skipped(self) -> int:
+        """None are ever left out."""
+        return 0
+
+    def __len__(self) -> int:
+        return len(self._drive)
+
+    def __iter__(self) -> Iterator[StereoPair]:
+        return iter(self._drive)
+
+    def truth(self) -> Trajectory:
+        """The true pose of every frame, in the town's axes."""
+        stamps = [self._drive.stamp_ns(k) for k in range(len(self._drive))]
+        return Trajectory(np.array(stamps, dtype=np.int64), self._drive.world_from_cams())

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from engram.graph.clock import hour_of_day
-from engram.maps import Map
 from engram.maps.exchange import MapRows
+from engram.maps.map import Map
 from engram.maps.schema import nodes, revisions
 
 _KEPT = 8

@@ -14,19 +14,16 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
-from engram.centre.access.enrolment import names_of, subject_of
-from engram.centre.access.roles import Role, Subject
-from engram.centre.api.context import COOKIE, Asking, CentreHere, takes, who_asks
-from engram.centre.downloads import Downloads
-from engram.centre.dreams import Dreams
+from engram.centre.access import Role, Subject, names_of, subject_of
+from engram.centre.database import first_broken, newest_events
 from engram.centre.errors import CentreError, UnknownError
-from engram.centre.fleet import Fleet
+from engram.centre.fleet import Fleet, Refs
 from engram.centre.handins import HandIns
+from engram.centre.jobs import Downloads, Dreams
 from engram.centre.pages.positions import drawn, thumbnail
-from engram.centre.refs import Refs
+from engram.centre.requests import COOKIE, Asking, CentreHere, takes, who_asks
 from engram.centre.service import Centre
-from engram.centre.store.audit import first_broken, newest_events
-from engram.maps import map_log
+from engram.maps.history import map_log
 from engram.untrusted import printable
 
 router = APIRouter(include_in_schema=False)

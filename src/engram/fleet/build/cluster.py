@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from uuid import uuid4
 
 from engram.errors import EngramError, MissingExtraError, WorkerError
-from engram.fleet.build.group_mapping import GroupResult, GroupTask, map_group_far_away
-from engram.fleet.build.scratch import keeping
+from engram.fleet.build.scratch import GroupResult, GroupTask, keeping, map_group_far_away
 from engram.monitor import Monitor, write_whole
 from engram.processes import LISTEN_S, MAX_RETRIES, WordsTogether
 

@@ -19,9 +19,11 @@ from engram.counts import counted
 from engram.errors import ConfigError
 from engram.fleet.merge.gate import held_as
 from engram.graph.model import Session
-from engram.maps import Map
+from engram.maps.map import Map
 from engram.measures import Drive, Estimator
-from engram.robot import DriveSequence, RobotOptions, Settings, open_drive, session_of_drive
+from engram.robot.localisers import DriveSequence, session_of_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.opening import open_drive
 
 # 7 groups have 5,040 orders, which take days.
 _MOST_GROUPS = 6

@@ -19,12 +19,9 @@ from engram.config import plain, to_dict
 from engram.counts import counted
 from engram.errors import InputError
 from engram.files import check_parent, draft_folder
-from engram.fleet.download.bridges import components
-from engram.fleet.download.coverage import Coverage, expected_missed
-from engram.fleet.download.forecast import Forecast, Light
-from engram.fleet.download.marks import write_marks
+from engram.fleet.download.coverage import Coverage, Forecast, Light, expected_missed
 from engram.fleet.download.mission import DownloadOptions
-from engram.fleet.download.part import Part
+from engram.fleet.download.part import Part, Stock, components, write_marks
 from engram.fleet.download.selections import (
     SELECTIONS,
     Selection,
@@ -32,8 +29,8 @@ from engram.fleet.download.selections import (
     coverage_for,
     facts_told,
 )
-from engram.fleet.download.stock import Stock
-from engram.maps import Map, compact_map, publish_map
+from engram.maps.map import Map
+from engram.maps.map_files import compact_map, publish_map
 from engram.monitor import QUIET, Monitor
 
 # Bytes of a node beside its blobs: rows and indices of it, its edges and path entries. Only the

@@ -1,27 +1,379 @@
-"""The records of a download: which of the fleet map's go along with the chosen nodes."""
+"""The records of a fleet map, and which of them go along with the chosen nodes.
+
+Edges across omitted nodes, so that a download stays as connected as the fleet map (method §7).
+Every omitted node belongs to the basin of the sent node that reaches it along the chain of least
+variance. If two basins touch, the chain between their two sent nodes is a candidate. A spanning
+tree of candidates closes every gap. Short candidates are sent as well: two experiences that were
+tied every few metres through a third one stay tied every few metres.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.fleet.download.bridges import close_gaps
-from engram.fleet.download.stock import Mask, Stock
+from engram.errors import InputError
+from engram.geometry.se3 import SE3, propagate_covariance
+from engram.graph.basin import BasinCounts
+from engram.graph.clock import hour_of_day, zone_note
+from engram.graph.graph import ExperienceGraph, Links
 from engram.graph.model import (
     Amendment,
     Edge,
+    EdgeKind,
+    Goal,
+    Mark,
+    Node,
     NodeId,
     Omission,
     PathEntry,
     PathId,
+    Placement,
     Session,
+    SessionId,
     path_id,
 )
-from engram.maps import RevisionWriter, StoredNode
+from engram.graph.paths import Attempts
+from engram.maps.map import Map
+from engram.maps.map_frame import ORIGIN
+from engram.maps.records import StoredNode
+from engram.maps.writer import RevisionWriter
 from engram.monitor import Monitor
+from engram.places.words import NodeWords, words_of
+from engram.robot.anchors import had_goal
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_LISTED = 3
+
+
+class Stock:
+    """A fleet map as of one revision, for selections.
+
+    Attributes:
+        store: the map.
+        contents: its records in the order of the store.
+        sessions: in the order of their starts, then UUIDs.
+        nodes: by session, then stamp, then UUID.
+        index: place of each node in `nodes`.
+        edges: by their ends and kind.
+        graph: of these nodes and edges; dense indices are places in `nodes`.
+    """
+
+    def __init__(self, store: Map) -> None:
+        self.store = store
+        self.contents = store.load()
+        self.sessions: list[Session] = sorted(
+            self.contents.sessions, key=lambda one: (one.start_ns, one.id)
+        )
+        place = {one.id: at for at, one in enumerate(self.sessions)}
+        self.nodes: list[Node] = sorted(
+            self.contents.nodes, key=lambda one: (place[one.session], one.stamp_ns, one.id)
+        )
+        self.index = {node.id: at for at, node in enumerate(self.nodes)}
+        self.edges: list[Edge] = sorted(
+            self.contents.edges, key=lambda edge: (edge.a, edge.b, edge.kind)
+        )
+        self.graph = ExperienceGraph()
+        for node in self.nodes:
+            self.graph.add_node(node)
+        self.graph.add_edges(self.edges)
+        self.session_of: NDArray[np.int64] = np.array(
+            [place[node.session] for node in self.nodes], np.int64
+        )
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def everything(self) -> Mask:
+        """(N,) bool, all True: every node."""
+        return np.ones(len(self), np.bool_)
+
+    @cached_property
+    def content_hash(self) -> str:
+        """Content hash of the fleet map at this revision."""
+        return self.store.content_hash()
+
+    @cached_property
+    def words(self) -> NodeWords | None:
+        """Words of the nodes; None while the fleet map is empty."""
+        kind = self.store.descriptor
+        return None if kind is None else words_of(self.store, kind)
+
+    @cached_property
+    def node_ids(self) -> list[NodeId]:
+        """UUIDs of `nodes`."""
+        return [node.id for node in self.nodes]
+
+    @cached_property
+    def hours(self) -> Array:
+        """(N,) hour of day of each node (method §2.8), NaN if unknown."""
+        by_id = {one.id: one for one in self.sessions}
+        known = (hour_of_day(by_id[node.session], node.stamp_ns) for node in self.nodes)
+        return np.array([np.nan if hour is None else hour for hour in known], np.float64)
+
+    def known_hours(self) -> Array:
+        """`hours` (N,), at least one of which is known.
+
+        Raises:
+            InputError: all are unknown.
+        """
+        if not np.isfinite(self.hours).any():
+            without = [one for one in self.sessions if hour_of_day(one, one.start_ns) is None]
+            listed = ", ".join(f"{one.robot} {str(one.id)[:8]}" for one in without[:_LISTED])
+            raise InputError(
+                f"{_zones_told(without)}no node of {self.store.location} has a known hour of day: "
+                f"{len(without)} of {len(self.sessions)} sessions ({listed}…) have no UTC clock or "
+                "neither longitude nor time zone; set it with engram amend, or choose --select "
+                "copy, region or route"
+            )
+        return self.hours
+
+    @cached_property
+    def on_path(self) -> dict[PathId, NDArray[np.int64]]:
+        """(n,) int64 for each path: dense indices of its nodes in order, once per visit."""
+        found: dict[PathId, list[int]] = {}
+        for entry in self.contents.path_entries:
+            found.setdefault(entry.path, []).append(self.index[entry.node])
+        return {path: np.array(nodes, np.int64) for path, nodes in found.items()}
+
+    @cached_property
+    def entries(self) -> list[PathEntry]:
+        """Path entries by path and sequence."""
+        return sorted(self.contents.path_entries, key=lambda entry: (entry.path, entry.sequence))
+
+    @cached_property
+    def attempts(self) -> Attempts:
+        """Remembered attempts; sessions and nodes are places in `sessions` and `nodes`."""
+        made = self.contents.attempts
+        place = {one.id: at for at, one in enumerate(self.sessions)}
+        session = np.array([place[one.id] for one in self.contents.sessions], np.int32)
+        node = np.array([self.index[one.id] for one in self.contents.nodes], np.int32)
+        found = replace(
+            made,
+            session=session[made.session],
+            reference=node[made.reference],
+            node=node[made.node],
+        )
+        return found.rows(np.argsort(found.session, kind="stable"))
+
+    @cached_property
+    def basin_counts(self) -> BasinCounts:
+        """Counts from which match basins are learnt."""
+        places = [self.graph.index(node.id) for node in self.contents.nodes]
+        return self.contents.basin_counts(self.graph.experiences[places])
+
+    @cached_property
+    def sizes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(N,) bytes of the landmarks of each node, and (N,) of its thumbnail."""
+        found = self.store.blob_sizes
+        both = np.array([found[node] for node in self.node_ids], np.int64).reshape(-1, 2)
+        return both[:, 0], both[:, 1]
+
+    def named_node(self, prefix: str) -> int:
+        """Dense index of the one node whose UUID begins with `prefix`.
+
+        Raises:
+            InputError: no node or several match, or a revert has hidden it.
+        """
+        origin = self.store.origin(prefix)
+        if origin.node not in self.index:
+            raise InputError(f"node {origin.node} was reverted in revision {origin.told[-1][0]}")
+        return self.index[origin.node]
+
+    def place_of(self, session: SessionId) -> int:
+        """Place of a session in `sessions`."""
+        return next(at for at, one in enumerate(self.sessions) if one.id == session)
+
+
+def _zones_told(sessions: Sequence[Session]) -> str:
+    """Why the hours of these sessions are unknown although they have zones."""
+    notes = {note: None for one in sessions if (note := zone_note(one))}
+    return "".join(f"{note}; " for note in notes)
+
+
+# Beyond the reach of a neighbourhood search (`SearchConfig.margin_m`), a bridge shortens nothing.
+_NEAR_M = 12.0
+# Metres per radian in the cost of a chain: the usual distance of a landmark.
+_LEVER_M = 10.0
+# Chains of perfectly known edges still prefer fewer edges.
+_LEAST_COST = 1e-12
+
+
+def close_gaps(
+    nodes: Sequence[NodeId], edges: Sequence[Edge], sent: NDArray[np.bool_]
+) -> list[Edge]:
+    """Bridges between sent nodes, composed through omitted nodes.
+
+    Args:
+        nodes: all nodes of the graph.
+        edges: all its edges.
+        sent: (N,) bool, which nodes are sent.
+
+    Returns:
+        Edges of kind `bridge`, with summed covariances, ordered by their ends. With them the sent
+        nodes are in as many components as they are in the whole graph.
+    """
+    if sent.all() or not sent.any():
+        return []
+    index = {node: at for at, node in enumerate(nodes)}
+    ends = np.array([(index[edge.a], index[edge.b]) for edge in edges], np.int64).reshape(-1, 2)
+    # Of several edges between two nodes, the one of least variance.
+    steps = Links.lightest(ends, np.array([_variance(edge.covariance) for edge in edges]))
+    search = _Search(nodes, edges, ends, steps, sent)
+    needed, near = search.candidates()
+    chosen = {pair: search.bridge(*pair) for pair in needed}
+    for pair in near:
+        bridge = chosen.get(pair) or search.bridge(*pair)
+        if bridge.a_from_b.distance_m <= _NEAR_M:
+            chosen[pair] = bridge
+    return [chosen[pair] for pair in sorted(chosen)]
+
+
+def components(count: int, ends: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) label of each node's component."""
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    links = csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)
+
+
+def _variance(covariance: Array) -> float:
+    diagonal = np.diag(covariance)
+    return max(float(diagonal[:3].sum() + _LEVER_M**2 * diagonal[3:].sum()), _LEAST_COST)
+
+
+class _Search:
+    """Chains from sent nodes outwards through omitted nodes."""
+
+    def __init__(
+        self,
+        nodes: Sequence[NodeId],
+        edges: Sequence[Edge],
+        ends: NDArray[np.int64],
+        steps: Links,
+        sent: NDArray[np.bool_],
+    ) -> None:
+        self._nodes, self._edges, self._ends, self._steps = nodes, edges, ends, steps
+        self._sent = sent
+        # Edges between two sent nodes are sent themselves.
+        self._through = ~(sent[steps.low] & sent[steps.high])
+        inner = sent[ends].all(axis=1)
+        self._joined = components(len(nodes), ends[inner])
+        odometry = np.array([edge.kind is EdgeKind.ODOMETRY for edge in edges], np.bool_)
+        self._pieces = components(len(nodes), ends[inner & odometry])
+        self._edge_of = {
+            (int(low), int(high)): int(edge)
+            for low, high, edge in zip(steps.low, steps.high, steps.edge, strict=True)
+        }
+        self._reach()
+
+    def _reach(self) -> None:
+        """The chain of least variance from any sent node to each omitted node."""
+        from scipy.sparse.csgraph import dijkstra
+
+        steps, through = self._steps, self._through
+        links = steps.matrix(len(self._nodes), through)
+        self._cost, self._before, self._source = dijkstra(
+            links,
+            directed=False,
+            indices=np.flatnonzero(self._sent),
+            min_only=True,
+            return_predecessors=True,
+        )
+
+    def candidates(self) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+        """Pairs of sent nodes that a bridge may join.
+
+        Returns:
+            A spanning tree over the gaps; and for each node the pair of least variance to every
+            other piece of an experience.
+        """
+        steps, through = self._steps, self._through
+        self._border: dict[tuple[int, int], tuple[float, int]] = {}
+        for at in np.flatnonzero(through):
+            low, high = int(steps.low[at]), int(steps.high[at])
+            sources = int(self._source[low]), int(self._source[high])
+            if min(sources) < 0 or sources[0] == sources[1]:  # unreached, or inside one basin
+                continue
+            cost = float(self._cost[low] + steps.weight[at] + self._cost[high])
+            pair = (min(sources), max(sources))
+            if pair not in self._border or cost < self._border[pair][0]:
+                self._border[pair] = (cost, int(at))
+        ordered = sorted(self._border, key=lambda pair: (self._border[pair][0], pair))
+        return self._spanning(ordered), self._nearest(ordered)
+
+    def _spanning(self, ordered: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Kruskal's tree over the components of the sent nodes."""
+        root = {int(label): int(label) for label in np.unique(self._joined)}
+
+        def find(label: int) -> int:
+            while root[label] != label:
+                root[label] = root[root[label]]
+                label = root[label]
+            return label
+
+        needed = []
+        for pair in ordered:
+            a, b = (find(int(self._joined[node])) for node in pair)
+            if a != b:
+                root[max(a, b)] = min(a, b)
+                needed.append(pair)
+        return needed
+
+    def _nearest(self, ordered: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Candidates of least variance from either end to the other's piece."""
+        taken: dict[int, set[int]] = defaultdict(set)
+        kept = []
+        for a, b in ordered:
+            pieces = int(self._pieces[a]), int(self._pieces[b])
+            if pieces[0] == pieces[1]:
+                continue
+            if pieces[1] not in taken[a] or pieces[0] not in taken[b]:
+                kept.append((a, b))
+            taken[a].add(pieces[1])
+            taken[b].add(pieces[0])
+        return kept
+
+    def bridge(self, a: int, b: int) -> Edge:
+        """The chain between two sent nodes as one edge."""
+        _, at = self._border[a, b]
+        ends = [int(self._steps.low[at]), int(self._steps.high[at])]
+        if int(self._source[ends[0]]) != a:
+            ends.reverse()
+        chain = [*reversed(self._back(ends[0])), *self._back(ends[1])]
+        a_from_end, covariance = SE3.identity(), np.zeros((6, 6))
+        for near, far in pairwise(chain):
+            near_from_far, step = self._step(near, far)
+            covariance = propagate_covariance(a_from_end, covariance, step)
+            a_from_end = a_from_end @ near_from_far
+        covariance = (covariance + covariance.T) / 2
+        return Edge(self._nodes[a], self._nodes[b], EdgeKind.BRIDGE, a_from_end, covariance)
+
+    def _back(self, node: int) -> list[int]:
+        """From a node to the sent node whose basin it is in."""
+        chain = [node]
+        while not self._sent[chain[-1]]:
+            chain.append(int(self._before[chain[-1]]))
+        return chain
+
+    def _step(self, near: int, far: int) -> tuple[SE3, Array]:
+        """``near_from_far`` and its covariance."""
+        at = self._edge_of[min(near, far), max(near, far)]
+        edge = self._edges[at]
+        if int(self._ends[at, 0]) == near:
+            return edge.a_from_b, edge.covariance
+        b_from_a = edge.a_from_b.inverse()
+        adjoint = b_from_a.adjoint()
+        return b_from_a, adjoint @ edge.covariance @ adjoint.T
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,3 +514,72 @@ class Part:
             if nodes is not None and self.sent[nodes].any():
                 wanted[at] = True
         return wanted
+
+
+# The robot's map speaks of the fleet's frame if the nodes of both lie as near as this, metres.
+_SAME_FRAME_M = 0.01
+
+
+def write_marks(writer: RevisionWriter, part: Part) -> None:
+    """Writes the marks of a part into an empty map, after its nodes.
+
+    Nodes keep their place in the map frame, so a robot and its fleet speak of the same frame. A
+    goal whose node is not sent moves to the nearest one that is.
+    """
+    store = part.stock.store
+    sent = set(part.node_ids)
+    for removal in store.removals:
+        if {removal.a, removal.b} <= sent:
+            writer.add_mark(removal)
+    for node in part.node_ids:
+        if node in store.placements:
+            writer.add_mark(Placement(node, store.placements[node]))
+    for anchor in store.anchors:
+        if anchor.node in sent:
+            writer.add_mark(anchor)
+    origin = store.statistics().get(ORIGIN)
+    if origin is not None:
+        writer.put_statistic(ORIGIN, origin)
+    for goal in _goals(part):
+        writer.add_mark(goal)
+
+
+def lacking_marks(part: Part, own: Map) -> list[Mark]:
+    """The marks of a part that are new to a robot's map; of places those of nodes new to it."""
+    store, sent = part.stock.store, set(part.node_ids)
+    lacking: list[Mark] = [
+        removal
+        for removal in store.removals
+        if {removal.a, removal.b} <= sent and removal.key not in own.seen_removals
+    ]
+    lacking += [
+        goal for goal in _goals(part) if goal.name not in own.goals and not had_goal(own, goal)
+    ]
+    if _one_frame(own.placements, store.placements):
+        lacking += [
+            Placement(node, store.placements[node])
+            for node in part.node_ids
+            if node in store.placements and node not in own.placements
+        ]
+    return lacking
+
+
+def _one_frame(own: Mapping[NodeId, SE3], fleet: Mapping[NodeId, SE3]) -> bool:
+    shared = [node for node in own if node in fleet]
+    apart = (own[node].inverse() @ fleet[node] for node in shared)
+    return bool(shared) and all(one.distance_m <= _SAME_FRAME_M for one in apart)
+
+
+def _goals(part: Part) -> Iterator[Goal]:
+    """The goals, each in a sent node; without those that none is connected with."""
+    stock, sent = part.stock, part.sent
+    for _, goal in sorted(stock.store.goals.items()):
+        root = stock.index[goal.node]
+        if sent[root]:
+            yield goal
+            continue
+        tree = stock.graph.chains_from(root)
+        near = next((int(node) for node in tree.nodes if sent[node]), None)
+        if near is not None:
+            near_from_goal = tree.pose(near).inverse() @ goal.node_from_goal
+            yield Goal(goal.name, stock.node_ids[near], near_from_goal)

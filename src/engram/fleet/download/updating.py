@@ -21,16 +21,23 @@ from engram.counts import counted
 from engram.errors import IncompatibleError, InputError
 from engram.files import draft_folder
 from engram.fleet.download.downloading import choose_part, revision_of
-from engram.fleet.download.marks import lacking_marks
 from engram.fleet.download.mission import DownloadOptions
-from engram.fleet.download.part import Part
+from engram.fleet.download.part import Mask, Part, Stock, lacking_marks
 from engram.fleet.download.selections import SELECTIONS, check_options, facts_told
-from engram.fleet.download.stock import Mask, Stock
-from engram.fleet.merge.positions import position_of, uncertainty_m2
-from engram.fleet.merge.state import FIRST_REPLAYED
-from engram.graph.marks import Removed
-from engram.graph.model import Edge, EdgeKind, NodeId, PathEntry, PathEntryKind, PathId, Session
-from engram.maps import Map, MapContents, RevisionWriter
+from engram.fleet.merge.state import FIRST_REPLAYED, position_of, uncertainty_m2
+from engram.graph.model import (
+    Edge,
+    EdgeKind,
+    NodeId,
+    PathEntry,
+    PathEntryKind,
+    PathId,
+    Removed,
+    Session,
+)
+from engram.maps.map import Map
+from engram.maps.records import MapContents
+from engram.maps.writer import RevisionWriter
 from engram.monitor import QUIET, Monitor
 
 

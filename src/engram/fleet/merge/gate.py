@@ -1,22 +1,29 @@
-"""A gate before a merge: held-out drives must not localise worse in the merged map."""
+"""Gates of a merge: held-out drives must not localise worse, and no wrong edge may appear."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.counts import counted
 from engram.errors import ConfigError, RefusedError
 from engram.fleet.merge.report import HeldOutFigures, HeldOutReport
-from engram.graph.model import Session, session_id
-from engram.maps import Map
+from engram.graph.model import EdgeKind, NodeId, Session, session_id
+from engram.maps.map import Map
 from engram.measures import Drive, Estimator, failure, longest_gap_m, route_not_localised
 from engram.monitor import Monitor
-from engram.robot import RobotOptions, Settings, measure, open_drive, session_of_drive
-from engram.robot.session import DriveSequence
-from engram.sequences import FrameLog, first_pair_hash
+from engram.repair.finding import Finding, RepairConfig, find_wrong_edges
+from engram.robot.localisers import DriveSequence, session_of_drive
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import measure
+from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.opening import open_drive
+from engram.sequences.sequence import first_pair_hash
 
 # Map A is no worse than B if P_A ≤ P_B up to 20 m and A's longest gap is at most 1.5 times B's.
 _JUDGED_M = np.arange(0.0, 20.5, 0.5)
@@ -190,3 +197,53 @@ def _figures(drives: Sequence[Drive]) -> HeldOutFigures:
 
 def _curve(drives: Sequence[Drive]) -> NDArray[np.float64]:
     return failure(drives, _JUDGED_M)
+
+
+_Key: TypeAlias = tuple[NodeId, NodeId, EdgeKind]
+
+
+class GeometryGate:
+    """Finds the wrong edges of the fleet map after each merge.
+
+    Args:
+        refuses: whether a merge that brings new ones is refused.
+        config: what counts as wrong.
+    """
+
+    def __init__(self, *, refuses: bool, config: RepairConfig | None = None) -> None:
+        self._refuses = refuses
+        self._config = config
+        self._known: AbstractSet[_Key] = frozenset()
+
+    def look_at(self, place: Path, monitor: Monitor) -> None:
+        """Finds the wrong edges that the fleet map has before the first merge."""
+        if self._refuses:
+            with Map.open(place) as store:
+                self._known = {_key(one) for one in self._wrong(store, monitor)}
+
+    def __call__(self, store: Map, source: str, monitor: Monitor) -> list[dict[str, Any]]:
+        """The wrong edges of the fleet map with an open merge, as plain values.
+
+        Raises:
+            RefusedError: some of them are new.
+        """
+        wrong = self._wrong(store, monitor)
+        new = [one for one in wrong if _key(one) not in self._known]
+        if self._refuses and new:
+            raise RefusedError(
+                f"{source} would add {counted(len(new), 'wrong edge')}, the most certain of them: "
+                f"{new[0].text()}; repair it with engram check {source} --geometry --repair"
+            )
+        self._known = {_key(one) for one in wrong}
+        return [one.to_dict() for one in wrong]
+
+    def _wrong(self, store: Map, monitor: Monitor) -> tuple[Finding, ...]:
+        if not len(store.graph):
+            return ()
+        return find_wrong_edges(
+            store.graph, store.path_memory, store.frames, self._config, monitor=monitor
+        ).wrong
+
+
+def _key(one: Finding) -> _Key:
+    return one.edge.a, one.edge.b, one.edge.kind

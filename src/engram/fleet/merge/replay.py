@@ -1,21 +1,27 @@
-"""Replays a robot's segments in the fleet map as if they were live streams (method §7.3)."""
+"""Replays a robot's segments in the fleet map as if they were live streams (method §7.2–7.3).
+
+Relocates a robot behind a gap of its odometry. Odometry may fail for a second or two, in a bend or
+in rain, and the nodes behind such a gap are not connected to those before it. The robot's speed
+predicts its position behind the gap well enough to match there, as a live robot does, before place
+recognition searches the whole map.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
-from engram.fleet.merge.behind_gaps import Ahead, look_along, position_behind_gap
-from engram.fleet.merge.held import Held
-from engram.fleet.merge.positions import beyond, recomposed, uncertainty_m2
+import numpy as np
+from numpy.typing import NDArray
+
 from engram.fleet.merge.report import KeptNode, Reason, Seed, SegmentReport
-from engram.fleet.merge.segments import Segment
-from engram.fleet.merge.settings import MergeOptions
-from engram.fleet.merge.state import Merge
-from engram.fleet.merge.whole_segments import SeedFrom, Unit, localises_well
-from engram.frontend import Frame, FrameStatus
+from engram.fleet.merge.settings import MergeOptions, SeedFrom, Unit, localises_well
+from engram.fleet.merge.state import Merge, beyond, recomposed, seen_from, uncertainty_m2
+from engram.frontend.frame import Frame, FrameStatus
+from engram.geometry.se3 import SE3
 from engram.graph.model import (
     Attempt,
     Edge,
@@ -29,23 +35,225 @@ from engram.graph.model import (
     path_id,
 )
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
-from engram.localiser import (
+from engram.localiser.attempts import Outcome
+from engram.localiser.localisation import (
     Budget,
     Hint,
     Keeper,
     Localisation,
-    Localiser,
+    LocalisationStatus,
     Position,
-    Relocaliser,
 )
-from engram.localiser.attempts import Outcome
-from engram.mapper import match_edges
-from engram.maps import StoredNode
+from engram.localiser.localiser import Localiser
+from engram.localiser.relocalisation import Relocaliser
+from engram.mapper.mapper import match_edges
+from engram.maps.records import StoredNode
 from engram.monitor import Monitor
-from engram.odometry import Motion, OdometryStatus, OdometryStep
-from engram.robot import Front, Robot, Settings
+from engram.odometry.motion import GapConfig, GapFiller, Motion
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.robot.front import Front
 from engram.robot.localisers import localiser_in, relocaliser_in
-from engram.sequences import LoggedFrame
+from engram.robot.robot import Robot
+from engram.robot.settings import Settings
+from engram.sequences.sequence import LoggedFrame
+
+
+@dataclass(slots=True, eq=False)
+class Held:
+    """A replayed node, held back while its fix or one before it may still be withdrawn.
+
+    Attributes:
+        stored, live: the node, and its frame.
+        found: its localisation; not localised once its fix is withdrawn.
+        outcomes: of the frame's attempts.
+        attempts: as a map stores them.
+    """
+
+    stored: StoredNode
+    live: Frame
+    found: Localisation
+    outcomes: Sequence[Outcome]
+    attempts: list[Attempt]
+
+    def withdrawn(self, *, is_the_fix: bool) -> None:
+        """Drops the position; for the disproved fix, its match too."""
+        self.found = replace(self.found, position=None)
+        if is_the_fix:
+            self.found = replace(
+                self.found,
+                status=LocalisationStatus.LOST,
+                node=None,
+                node_from_live=None,
+                covariance=None,
+            )
+            self.outcomes = ()
+            self.attempts = [replace(one, accepted=False) for one in self.attempts]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segment:
+    """A chain of nodes of one session, in the order of time.
+
+    Attributes:
+        nodes: at least one.
+        steps: the odometry edges between them, one fewer than nodes; each in its stored
+            direction.
+    """
+
+    nodes: tuple[Node, ...]
+    steps: tuple[Edge, ...]
+
+    @property
+    def key(self) -> tuple[int, NodeId]:
+        """Sort key of a session's segments: stamp and UUID of the first node."""
+        return self.nodes[0].stamp_ns, self.nodes[0].id
+
+    @property
+    def motions(self) -> list[tuple[SE3, NDArray[np.float64]]]:
+        """``prev_from_curr`` of each node but the first, and its (6, 6) covariance."""
+        return [
+            seen_from(edge, before.id)[1:]
+            for edge, before in zip(self.steps, self.nodes[:-1], strict=True)
+        ]
+
+
+def string_segments(nodes: Sequence[Node], edges: Iterable[Edge]) -> list[Segment]:
+    """Maximal chains of nodes linked by odometry edges, never across sessions.
+
+    Every node is in one segment; one without an odometry edge forms its own. The result does
+    not depend on the order of nodes or edges.
+
+    Args:
+        nodes: the nodes to divide.
+        edges: any edges; only odometry edges between these nodes count.
+
+    Returns:
+        Segments by the stamp of their first node, then its UUID.
+
+    Source: method §7.2; [G16] §V-A, Algorithm 1.
+    """
+    known = {node.id: node for node in nodes}
+    following = _steps(known, edges)
+    entered = {after for after, _ in following.values()}
+    strung = [_from(node, known, following) for node in nodes if node.id not in entered]
+    return sorted(strung, key=lambda segment: segment.key)
+
+
+def _from(
+    first: Node, known: dict[NodeId, Node], following: dict[NodeId, tuple[NodeId, Edge]]
+) -> Segment:
+    """The chain from a node; it ends, since steps lead forward in time."""
+    nodes, steps = [first], []
+    while (step := following.get(nodes[-1].id)) is not None:
+        after, edge = step
+        nodes.append(known[after])
+        steps.append(edge)
+    return Segment(tuple(nodes), tuple(steps))
+
+
+def _steps(known: dict[NodeId, Node], edges: Iterable[Edge]) -> dict[NodeId, tuple[NodeId, Edge]]:
+    """The next node of each node, and the edge between them.
+
+    If edges branch, the one with the smaller time step is taken, then the smaller UUIDs: each node
+    has at most one edge to an earlier node and one to a later node.
+    """
+    oriented: list[tuple[int, NodeId, NodeId, Edge]] = []
+    for edge in edges:
+        a, b = known.get(edge.a), known.get(edge.b)
+        if edge.kind is not EdgeKind.ODOMETRY or a is None or b is None or a.session != b.session:
+            continue
+        if (b.stamp_ns, b.id) < (a.stamp_ns, a.id):
+            a, b = b, a
+        oriented.append((b.stamp_ns - a.stamp_ns, a.id, b.id, edge))
+    # Of two opposite edges between the same nodes, the edge's key decides.
+    oriented.sort(key=lambda one: (one[0], one[1], one[2], one[3].a))
+    chosen: dict[NodeId, tuple[NodeId, Edge]] = {}
+    entered: set[NodeId] = set()
+    for _, a_id, b_id, edge in oriented:
+        if a_id not in chosen and b_id not in entered:
+            chosen[a_id] = b_id, edge
+            entered.add(b_id)
+    return chosen
+
+
+# Longest gap for a guess. Source: method §3.4, the distance after which a robot is lost.
+_GUESS_WITHIN_M = 10.0
+# Longest part of a segment that is searched. Source: the distance after which own nodes are
+# neighbours again (method §3.1).
+_LOOK_WITHIN_M = 30.0
+# Least distance of two agreeing matches that relocate a robot (`Hypotheses`).
+_BASE_LINE_M = 4.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ahead:
+    """A node of a segment that was localised ahead of its turn.
+
+    Attributes:
+        found: its localisation.
+        outcomes: outcomes of its attempts.
+    """
+
+    found: Localisation
+    outcomes: list[Outcome]
+
+
+def position_behind_gap(
+    end: Position, before: Segment, segment: Segment, config: GapConfig
+) -> Position | None:
+    """Predicts the start of a segment from the robot's speed before the gap.
+
+    Args:
+        end: position of the last node of the segment before.
+        before: the segment before, of the same session.
+        segment: the one behind the gap.
+        config: how far a guess is trusted.
+
+    Returns:
+        The guess with its covariance (`GapFiller`); None if the speed is unknown, or if the robot
+            would have driven more than 10 m.
+    """
+    gaps = GapFiller(config)
+    gaps.motion(OdometryStep(OdometryStatus.FIRST), before.nodes[0].stamp_ns)
+    for node, motion in zip(before.nodes[1:], before.motions, strict=True):
+        gaps.motion(OdometryStep(OdometryStatus.OK, *motion), node.stamp_ns)
+    lost = OdometryStep(OdometryStatus.NO_CONSENSUS)
+    guess = gaps.motion(lost, segment.nodes[0].stamp_ns)
+    assert guess.prev_from_curr is not None
+    assert guess.covariance is not None
+    if guess.guessed_m > _GUESS_WITHIN_M or guess.moved_m > _GUESS_WITHIN_M:
+        return None
+    return end.carried_on(guess.prev_from_curr, guess.covariance)
+
+
+def look_along(robot: Robot, frames: Iterable[LoggedFrame]) -> tuple[Ahead | None, int]:
+    """Tries to localise the first frames of a segment from a guess of its start.
+
+    Args:
+        robot: placed at the guess; it tries nowhere else.
+        frames: of the segment, in the order of time.
+
+    Returns:
+        The first of two matched frames at least 4 m apart, or None; and the number of attempts.
+    """
+    first: Ahead | None = None
+    driven_m = first_at_m = 0.0
+    attempts = 0
+    for logged in frames:
+        driven_m += logged.odometry.moved_m
+        if driven_m > _LOOK_WITHIN_M:
+            break
+        found = robot.step(logged)
+        attempts += found.attempts
+        if not found.localised:
+            continue
+        if first is None:
+            assert robot.last is not None
+            first, first_at_m = Ahead(found, robot.last.outcomes), driven_m
+        elif driven_m - first_at_m >= _BASE_LINE_M:
+            return first, attempts
+    return None, attempts
+
 
 # A segment is seeded from a neighbour at most this far along it; beyond, by place recognition.
 # Source: the distance after which own nodes are neighbours again (method §3.1).

@@ -7,12 +7,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import groupby
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from engram.config import plain
 from engram.counts import counted
 from engram.graph.model import Session
-from engram.maps import Map, Moves
+from engram.maps.map import Map, open_map
+from engram.maps.map_frame import Moves
+from engram.viewing.pictures import Track, draw_panels
 
 # Drives listed in the text; JSON has all, segment by segment.
 _SHOWN_DRIVES = 12
@@ -304,3 +309,32 @@ class MergeReport:
             return "nothing new"
         made = "dry run" if self.dry_run else f"revision {self.revision}"
         return f"{made}, content {self.content_hash}, {counted(self.components, 'component')}"
+
+
+def picture_before_and_after(centre: Path, before: int, path: Path) -> None:
+    """Draws the nodes of the fleet map by robot, as of a revision and now.
+
+    Args:
+        centre: the map.
+        before: number of the revision to compare with.
+        path: image file.
+
+    Raises:
+        MissingExtraError: Matplotlib is not installed.
+    """
+    panels = []
+    for at in (before, None):
+        with open_map(centre, at) as opened:
+            words = f"{counted(len(opened.graph), 'node')}, revision {opened.revision}"
+            panels.append((f"{'before' if at is not None else 'after'}: {words}", _tracks(opened)))
+    draw_panels(panels, path)
+
+
+def _tracks(opened: Map) -> list[Track]:
+    """One per robot."""
+    places_m = opened.frame.positions[:, :2]
+    robots = np.array([opened.sessions[node.session].robot for node in opened.graph.nodes], object)
+    return [
+        Track(f"{robot} ({int((robots == robot).sum())})", places_m[robots == robot])
+        for robot in sorted(set(robots.tolist()))
+    ]

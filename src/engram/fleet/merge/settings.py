@@ -2,16 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from enum import StrEnum
 from typing import Annotated
 
 from msgspec import Meta
 
 from engram.config import check_bounds
 from engram.errors import ConfigError
-from engram.fleet.merge.whole_segments import SeedFrom, Unit
-from engram.localiser import RELOCALISERS, Budget
-from engram.ranking import check_for_robot
+from engram.localiser.localisation import Budget
+from engram.localiser.relocalisation import RELOCALISERS
+from engram.ranking.policies import check_for_robot
+from engram.robot.robot import Robot
+from engram.sequences.sequence import LoggedFrame
+
+
+class Unit(StrEnum):
+    """What MERGE omits or takes at once."""
+
+    FRAME = "frame"
+    SEGMENT = "segment"
+
+
+class SeedFrom(StrEnum):
+    """Where the replay of a segment starts."""
+
+    NEIGHBOUR = "neighbour"
+    PLACES = "places"
+
+
+def localises_well(robot: Robot, frames: Iterable[LoggedFrame], least_share: float) -> bool:
+    """Whether a segment localises in the fleet map as it is.
+
+    Args:
+        robot: placed at the segment's start, if that is known.
+        frames: of the segment, in the order of time.
+        least_share: share of the frames that must localise, in [0, 1].
+    """
+    found = [robot.step(logged).localised for logged in frames]
+    return sum(found) >= least_share * len(found)
+
 
 NO_RELOCALISER = "none"
 

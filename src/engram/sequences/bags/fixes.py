@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from engram.errors import InputError
-from engram.sequences.bags.bag import Bag
+from engram.sequences.bags.containers import Bag
 from engram.sequences.bags.messages import Decoder, timed_messages
 from engram.sequences.clocks import SteadyClock
 

@@ -1,26 +1,36 @@
-"""A bag as a drive: `BagSequence`."""
+"""A bag as a drive: its pairs by stamp, and what it holds."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from itertools import islice
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.calibration import Cameras, read_calibration
+from engram.calibration.cameras import Cameras
+from engram.calibration.formats import read_calibration
 from engram.counts import counted
-from engram.errors import CalibrationError, SequenceError
-from engram.frontend import StereoPair
-from engram.geometry import StereoCamera
+from engram.errors import CalibrationError, InputError, SequenceError
+from engram.frontend.frame import StereoPair
+from engram.geometry.cameras import StereoCamera
 from engram.graph.model import Clock
-from engram.odometry import MotionSource
-from engram.sequences.bags.bag import Bag
-from engram.sequences.bags.calibrating import (
+from engram.odometry.outside import MotionSource
+from engram.sequences.bags.containers import Bag, DamageError, files_of
+from engram.sequences.bags.fixes import FIX, Fix, fix_topics, fixes_of
+from engram.sequences.bags.messages import (
+    IMU,
+    ODOMETRY,
+    TWIST,
+    BagMotion,
+    Decoder,
+    Stamps,
+    clock_of,
     mounted,
     mounting,
     read_cameras,
@@ -28,20 +38,152 @@ from engram.sequences.bags.calibrating import (
     read_transforms,
     with_constant,
 )
-from engram.sequences.bags.fixes import Fix, fix_topics, fixes_of
-from engram.sequences.bags.messages import Decoder, Stamps
-from engram.sequences.bags.motion import BagMotion
-from engram.sequences.bags.pairing import Pairing, Shot, learnt_tolerance, pairs_of
-from engram.sequences.bags.pictures import depth_of, grey_of, size_of
-from engram.sequences.bags.records import DamageError
-from engram.sequences.bags.topics import StereoTopics, only_topic, same_images, stereo_topics
+from engram.sequences.bags.topics import (
+    StereoTopics,
+    depth_of,
+    grey_of,
+    only_topic,
+    same_images,
+    size_of,
+    stereo_topics,
+)
 from engram.sequences.calibrating import TELLING, check_no_view, check_sides, read_mask
-from engram.sequences.clocks import StampReport, SteadyClock, in_time
-from engram.sequences.euroc import YEAR_2000_NS
-from engram.sequences.image_sequence import Side, half, rectified, with_options
+from engram.sequences.clocks import StampReport, SteadyClock, Timed, in_time, joined
+from engram.sequences.layouts import YEAR_2000_NS, Side, half, rectified, with_options
+from engram.sequences.listing import paired
 from engram.sequences.motion import stamp_facts_of_files
-from engram.sequences.options import OpenOptions
-from engram.sequences.sequence import SequenceInfo
+from engram.sequences.sequence import OpenOptions, SequenceInfo
+
+T = TypeVar("T")
+
+# Stamps of one trigger differ by rounding at most.
+_LEAST_TOLERANCE_NS = 100_000
+# Bulk of the offsets, and how much more a pair may be apart.
+_BULK_PERCENT, _ALLOWANCE = 95, 3
+
+
+@dataclass(frozen=True, slots=True)
+class Shot(Generic[T]):
+    """One image of one topic.
+
+    Attributes:
+        number: its place on the topic, from 0.
+        stamp_ns: capture time, ns.
+        received_ns: when the recorder received it, ns.
+        content: the image, however it is stored.
+    """
+
+    number: int
+    stamp_ns: int
+    received_ns: int
+    content: T
+
+
+@dataclass(slots=True)
+class Pairing:
+    """Outcome of pairing the images in a pass through the bag.
+
+    Attributes:
+        tolerance_ns: largest offset of a pair.
+        left, right: images met on each topic.
+        paired: pairs of one instant.
+        largest_offset_ns: largest offset among them.
+        unusable: images that could not be decoded or do not fit.
+        placed: left images that have a time, and so a right one or none.
+        complete: whether the pass reached the end of the bag; if not, some images still waited.
+        clocks: of the left and of the right stamps.
+    """
+
+    tolerance_ns: int
+    left: int = 0
+    right: int = 0
+    paired: int = 0
+    largest_offset_ns: int = 0
+    unusable: int = 0
+    placed: int = 0
+    complete: bool = False
+    clocks: tuple[SteadyClock, SteadyClock] = field(
+        default_factory=lambda: (SteadyClock(waits=True), SteadyClock(waits=True))
+    )
+
+    @property
+    def stamps(self) -> StampReport:
+        """What happened to the stamps of the left images, and of right ones without theirs."""
+        return joined(*(clock.report for clock in self.clocks))
+
+    def text(self) -> str:
+        """For people, in one line."""
+        met = self.left if self.complete else self.placed
+        share = 100 * self.paired / met if met else 0.0
+        facts = [
+            f"{self.paired} of {counted(met, 'left image')} paired ({share:.1f} %), at most "
+            f"{self.largest_offset_ns / 1e6:.3f} ms apart (tolerance "
+            f"{self.tolerance_ns / 1e6:.3f} ms)"
+        ]
+        if self.unusable:
+            facts.append(f"{counted(self.unusable, 'image')} could not be used")
+        return "; ".join(facts)
+
+
+def learnt_tolerance(left_ns: Sequence[int], right_ns: Sequence[int], most_ns: int) -> int:
+    """Largest offset at which two images count as of one instant, ns.
+
+    Three times the offset that 95 % of the images stay below, but less than half of the interval
+    between images.
+
+    Args:
+        left_ns, right_ns: stamps of the first images of each topic.
+        most_ns: the largest that may be learnt.
+
+    Raises:
+        SequenceError: no images of the two topics are of one instant.
+    """
+    left, right = np.sort(np.array(left_ns, np.int64)), np.sort(np.array(right_ns, np.int64))
+    after = np.searchsorted(right, left).clip(1, max(len(right) - 1, 1))
+    around = np.stack([right[(after - 1).clip(0)], right[after.clip(0, len(right) - 1)]])
+    offsets = np.abs(around - left).min(axis=0)
+    rising_ns = np.diff(np.array(left_ns, np.int64))
+    rising_ns = rising_ns[rising_ns > 0]  # where a clock was set back, others lie between
+    interval_ns = int(np.median(rising_ns)) if len(rising_ns) else 2 * most_ns
+    most_ns = min(most_ns, max(interval_ns // 2, 1))
+    near = offsets[offsets <= most_ns]
+    if not len(near):
+        raise SequenceError(
+            f"left and right images are not synchronised: typically "
+            f"{np.median(offsets) / 1e6:.1f} ms apart, at most {most_ns / 1e6:.1f} ms is a pair; "
+            "are these the topics of one stereo camera, triggered together?"
+        )
+    learnt = _ALLOWANCE * int(np.percentile(near, _BULK_PERCENT))
+    return min(max(learnt, _LEAST_TOLERANCE_NS), most_ns)
+
+
+def pairs_of(
+    left: Iterator[Shot[T]], right: Iterator[Shot[T]], pairing: Pairing
+) -> Iterator[tuple[Timed[Shot[T]], Shot[T] | None]]:
+    """Each left image that has a time, with the right one of its instant.
+
+    Both topics are read side by side, so that memory stays flat whatever the order of the bag.
+
+    Args:
+        left, right: the images of each topic.
+        pairing: counts what becomes of them.
+    """
+    timed = [
+        in_time(shots, lambda one: one.stamp_ns, clock, lambda one: one.received_ns)
+        for shots, clock in zip((left, right), pairing.clocks, strict=True)
+    ]
+    for shot, other in paired(timed[0], timed[1], pairing.tolerance_ns):
+        if shot is None:
+            continue
+        pairing.placed += 1
+        if other is not None:
+            pairing.paired += 1
+            offset_ns = abs(other.stamp_ns - shot.stamp_ns)
+            if offset_ns <= pairing.tolerance_ns:
+                pairing.largest_offset_ns = max(pairing.largest_offset_ns, offset_ns)
+        yield shot, None if other is None else other.item
+    pairing.complete = True
+
 
 # Images from which the tolerance of pairs is learnt.
 _LEARNT_FROM = 100
@@ -418,3 +560,206 @@ def _summed(faults: list[str]) -> str:
 
 def _frame(message: Any) -> str:
     return str(message.header.frame_id).lstrip("/")
+
+
+# A gap is this much longer than the usual interval.
+_GAP_RATIO = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class TopicFacts:
+    """One topic.
+
+    Attributes:
+        name, type: of the topic.
+        messages: how many it has.
+        rate_hz: usual rate; 0 for fewer than two messages.
+        size_bytes: of all its messages.
+        gaps: intervals of more than three times the usual one.
+        longest_gap_s: the longest of them; 0 if there is none.
+    """
+
+    name: str
+    type: str
+    messages: int
+    rate_hz: float
+    size_bytes: int
+    gaps: int
+    longest_gap_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class BagFacts:
+    """What a bag holds.
+
+    Attributes:
+        path: as given.
+        files: number of files.
+        size_bytes: of the files.
+        start_ns: when the first message was recorded.
+        duration_s: from the first to the last message.
+        topics: by name.
+        transforms: static transforms, "parent → child".
+        left, right: image topics of the stereo pair; None if they are not found.
+        question: why the pair or its calibration is not found; "" if it is.
+        calibration: what was found of the pair's calibration, in a line.
+        mounting: frame of the robot that the camera's mounting refers to, or "calibration" if
+            the given one states it; None if unknown.
+        command: the command that maps the bag.
+        notes: what was read otherwise than it is written.
+        lost: what could not be read.
+        stamps: what is wrong with the stamps of images, motion and fixes, for people.
+        faulty_share: share of the left images that are left out for a wrong stamp.
+    """
+
+    path: str
+    files: int
+    size_bytes: int
+    start_ns: int
+    duration_s: float
+    topics: list[TopicFacts]
+    transforms: list[str]
+    left: str | None
+    right: str | None
+    question: str
+    calibration: str
+    mounting: str | None
+    command: str
+    notes: list[str]
+    lost: list[str]
+    stamps: list[str]
+    faulty_share: float
+
+
+def describe_bag(path: Path, options: OpenOptions | None = None) -> BagFacts:
+    """Reads a bag's topics, calibration and transforms.
+
+    Args:
+        path: file or folder.
+        options: how it would be opened.
+
+    Raises:
+        SequenceError: it cannot be read.
+        MissingExtraError: the extra `bags` is not installed.
+    """
+    options = options or OpenOptions()
+    bag = Bag(path)
+    topics, start_ns, end_ns = _topics(bag)
+    static = read_transforms(bag, Decoder(bag.is_ros1))
+    drive, question = _opened(path, options)
+    left = None if drive is None else drive.topics.left
+    return BagFacts(
+        str(path),
+        len(files_of(path)),
+        bag.size_bytes,
+        start_ns,
+        (end_ns - start_ns) / 1e9,
+        topics,
+        [f"{parent} → {child}" for child, (parent, _) in sorted(static.parents.items())],
+        left,
+        None if drive is None else drive.topics.right,
+        question,
+        "" if drive is None else _calibration(drive),
+        _mounting(drive),
+        _command(path, options, topics, drive, question),
+        [] if drive is None else drive.notes,
+        bag.lost,
+        *_stamps(bag, drive),
+    )
+
+
+def _topics(bag: Bag) -> tuple[list[TopicFacts], int, int]:
+    """Facts of all topics; stamps of the first and the last message, ns."""
+    stamps: dict[str, list[int]] = {name: [] for name in bag.topics}
+    sizes = dict.fromkeys(bag.topics, 0)
+    for record in bag.records():
+        if record.topic in stamps:
+            stamps[record.topic].append(record.received_ns)
+            sizes[record.topic] += len(record.data)
+    facts = []
+    for name, found in sorted(stamps.items()):
+        intervals_ns = np.array([after - before for before, after in pairwise(sorted(found))])
+        usual_ns = float(np.median(intervals_ns)) if len(intervals_ns) else 0.0
+        gaps_ns = [one for one in intervals_ns.tolist() if one > _GAP_RATIO * max(usual_ns, 1.0)]
+        facts.append(
+            TopicFacts(
+                name,
+                bag.topics[name].type,
+                len(found),
+                1e9 / usual_ns if usual_ns else 0.0,
+                sizes[name],
+                len(gaps_ns),
+                max(gaps_ns, default=0) / 1e9,
+            )
+        )
+    every = [stamp for found in stamps.values() for stamp in found]
+    return facts, min(every, default=0), max(every, default=0)
+
+
+def _stamps(bag: Bag, drive: BagSequence | None) -> tuple[list[str], float]:
+    """Faults of stamps, for people, and the share of images left out because of them."""
+    facts, share = [], 0.0
+    if drive is not None:
+        share = drive.read_stamps().faulty_share
+        facts += drive.stamp_facts
+    decoder = Decoder(bag.is_ros1)
+    for topic in sorted(bag.topics.values(), key=lambda one: one.name):
+        if topic.type in {ODOMETRY, TWIST, IMU, FIX}:
+            facts += clock_of(bag, decoder, topic.name).report.texts(f"message of {topic.name}")
+    return facts, share
+
+
+def _opened(path: Path, options: OpenOptions) -> tuple[BagSequence | None, str]:
+    """The drive; or why the bag is not one yet."""
+    try:
+        return BagSequence(path, options), ""
+    except InputError as error:
+        return None, str(error).removeprefix(f"{path}: ")
+
+
+def _calibration(drive: BagSequence) -> str:
+    camera, raw = drive.camera, drive.cameras.raw
+    images = "rectified images" if raw is None else f"raw images, {raw.left.distortion} lenses"
+    return (
+        f"{camera.width}×{camera.height} px, fx {camera.fx:.1f} px, baseline "
+        f"{camera.baseline_m:.4f} m; {images}"
+    )
+
+
+def _mounting(drive: BagSequence | None) -> str | None:
+    if drive is None or drive.camera.cam_from_rig is None:
+        return None
+    return drive.transforms.base_of(drive.frame) or "calibration"
+
+
+def _command(
+    path: Path,
+    options: OpenOptions,
+    topics: list[TopicFacts],
+    drive: BagSequence | None,
+    question: str,
+) -> str:
+    """`engram map` with every option that this bag needs; what is to be filled in is in capitals.
+
+    Empty if no option helps.
+    """
+    asks = any(words in question for words in ("name them", "choose one", "name the topic twice"))
+    if drive is None and not asks and "--calibration FILE" not in question:
+        return ""
+    motion = [
+        topic.name for topic in topics if topic.type in {ODOMETRY, TWIST, IMU} and topic.messages
+    ]
+    words = ["engram", "map", "MAP.engram", str(path)]
+    for option, value in (("--left", options.left), ("--right", options.right)):
+        words += [option, value] if value else []
+    if drive is None and asks:
+        given = re.search(r"--left (\S+) --right (\S+)", question)
+        left, right = ("LEFT", "RIGHT") if given is None else given.groups()
+        words += ["--left", left, "--right", right]
+    if options.calibration is not None:
+        words += ["--calibration", str(options.calibration)]
+    elif drive is None and "--calibration FILE" in question:
+        words += ["--calibration", "FILE"]
+    for name in motion:
+        words += ["--motion", name]
+    return shlex.join(words)

@@ -12,21 +12,25 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, select
 
 from engram.errors import ConfigError, MapCorruptError, SequenceError
-from engram.geometry import StereoCamera, propagate_covariance
-from engram.odometry import MotionSource, OdometryStatus, OdometryStep
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import propagate_covariance
+from engram.odometry.outside import MotionSource
+from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.sequences.framelog.file import (
     FLIGHT_SUFFIX,
+    STEP_COLUMNS,
+    FrameLogHeader,
+    StepRow,
+    decode_frame,
+    decode_step,
     framelog_file,
     frames_table,
     log_digest,
     log_table,
 )
-from engram.sequences.framelog.header import FrameLogHeader
-from engram.sequences.framelog.rows import STEP_COLUMNS, StepRow, decode_frame, decode_step
-from engram.sequences.image_sequence import with_options
+from engram.sequences.layouts import with_options
 from engram.sequences.motion import motion_of_files
-from engram.sequences.options import Channel, OpenOptions
-from engram.sequences.sequence import LoggedFrame, SequenceInfo
+from engram.sequences.sequence import Channel, LoggedFrame, OpenOptions, SequenceInfo
 
 SUFFIX = ".framelog"
 

@@ -19,14 +19,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import StereoPair
-from engram.geometry import SE3, StereoCamera
+from engram.frontend.frame import StereoPair
+from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
 from engram.graph.model import Clock
 from engram.monitor import write_whole
-from engram.sequences import SequenceInfo
-from engram_lab.town import WORLD_VERSION
-from engram_lab.town.campaigns import SessionPlan, campaign_named
-from engram_lab.town.robots import ROBOTS, Robot
+from engram.sequences.sequence import SequenceInfo
+from engram_lab.town.campaigns import WORLD_VERSION, SessionPlan, campaign_named
+from engram_lab.town.drive import ROBOTS, Robot
 from engram_lab.town.session import SimulatedDrive
 from engram_lab.town.simulating import campaigns_folder
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend import StereoPair
+from engram.frontend.frame import StereoPair
 
 Image = NDArray[np.uint8]
 

@@ -14,21 +14,19 @@ from dataclasses import dataclass
 from functools import partial
 
 from engram.monitor import QUIET, Monitor
-from engram_lab.studies.drives import EvaluatedDrive
-from engram_lab.studies.fleet.arms import Arm
-from engram_lab.studies.fleet.orders import try_orders
-from engram_lab.studies.fleet.plan import FORAY_POLICIES, ROBOTS, FleetPlan
-from engram_lab.studies.fleet.stages import measure_stages
+from engram_lab.studies.drives import EvaluatedDrive, Fold
+from engram_lab.studies.fleet.plan import FORAY_POLICIES, ROBOTS, Arm, FleetPlan
 from engram_lab.studies.fleet.steps import (
     download_for_foray,
     kept_maps,
     localise_in,
     map_drives,
+    measure_stages,
     merge,
+    try_downloads_for,
+    try_orders,
 )
-from engram_lab.studies.fleet.trials import try_downloads_for
-from engram_lab.studies.folds import Fold
-from engram_lab.studies.tasks import Task
+from engram_lab.studies.plan import Task
 
 SINGLE = "single"
 DOCKED = "docked"

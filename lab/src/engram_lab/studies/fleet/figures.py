@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from engram.measures import Drive, route_not_localised
 from engram_lab.charts import Line, Panel, draw_bars, draw_curves
 from engram_lab.intervals import Resamples
-from engram_lab.studies.curves import CURVE_AT_M, failure_line
 from engram_lab.studies.fleet.experiments import SHARED, SINGLE, merged_name
 from engram_lab.studies.fleet.plan import FORAY_POLICIES, ROBOTS
 from engram_lab.studies.fleet.results import ArmResult, FoldResult, Time
-from engram_lab.studies.fleet.trials import TriedDownload
+from engram_lab.studies.fleet.steps import TriedDownload
+from engram_lab.studies.pages import CURVE_AT_M, failure_line
 
 Array = NDArray[np.float64]
 _LEAST_PERCENT = 0.01

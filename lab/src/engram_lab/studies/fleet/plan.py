@@ -1,7 +1,8 @@
-"""What the fleet study runs on which drives: [G16]'s protocols, scaled to the drives there are."""
+"""What the fleet study runs on which drives, in which arms, and what it keeps of it."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,13 +13,111 @@ import numpy as np
 from engram.cli.settings import AllSettings
 from engram.config import to_dict
 from engram.errors import ConfigError
-from engram.fleet.merge import NO_RELOCALISER
-from engram.robot import Settings
-from engram_lab.studies.drives import DriveSet, EvaluatedDrive
-from engram_lab.studies.fleet.arms import ARMS, USUAL_ARMS, Arm
-from engram_lab.studies.folds import Fold
-from engram_lab.studies.in_force import check_logs, check_lost
+from engram.fleet.merge.settings import NO_RELOCALISER, MergeOptions
+from engram.measures import Drive
+from engram.robot.settings import RobotOptions, Settings
+from engram_lab.studies.building import write_json
+from engram_lab.studies.configurations import UNLIMITED, Configuration
+from engram_lab.studies.drives import DriveSet, EvaluatedDrive, Fold
+from engram_lab.studies.in_force import Values, check_logs, check_lost
 from engram_lab.studies.plan import StudyOptions, StudyPlan, all_tables, study_folder
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One way to do everything.
+
+    Attributes:
+        letter: key in `ARMS`.
+        words: for tables and legends.
+        driving: how drives are mapped, localised as on a robot, and judge orders of merging.
+        merging: how maps are merged.
+    """
+
+    letter: str
+    words: str
+    driving: RobotOptions
+    merging: MergeOptions
+
+    @property
+    def configuration(self) -> Configuration:
+        """How held-out drives are localised."""
+        return Configuration(self.driving.ranking, self.driving.lanes, self.driving.rounds)
+
+
+@dataclass(frozen=True, slots=True)
+class ArmRule:
+    """What an arm sets; all else is as the settings say.
+
+    Attributes:
+        words: for tables and legends.
+        policy: key of `POLICIES`, for driving and merging; None for those of the settings.
+        lanes, rounds: Np and Nr of both, with the policy; counts only, so that the same input
+            gives the same maps.
+        sure_inliers: of `MergeSettings`; None for those of the settings.
+    """
+
+    words: str
+    policy: str | None = None
+    lanes: int = 0
+    rounds: int = 0
+    sure_inliers: int | None = None
+
+    def under(self, settings: AllSettings, letter: str, relocaliser: str | None) -> Arm:
+        """The arm under some settings.
+
+        Args:
+            settings: the tables `drive` and `merge` say what the arm leaves open.
+            letter: key in `ARMS`.
+            relocaliser: key of `RELOCALISERS`, for robots; None for none.
+        """
+        drive, merging = settings.drive, MergeOptions.of(settings.merge)
+        driving = RobotOptions(
+            drive.ranking,
+            drive.lanes,
+            drive.rounds,
+            relocaliser=relocaliser,
+            threads=drive.threads,
+        )
+        if self.policy is not None:
+            policy, lanes, rounds = self.policy, self.lanes, self.rounds
+            driving = replace(driving, ranking=policy, lanes=lanes, rounds=rounds)
+            merging = replace(merging, ranking=policy, lanes=lanes, rounds=rounds)
+        if self.sure_inliers is not None:
+            merging = replace(merging, sure_inliers=self.sure_inliers)
+        return Arm(letter, self.words, driving, merging)
+
+
+# What is run unless told.
+USUAL_ARMS = ("A", "B", "C")
+AS_SET = "S"
+ARMS = {
+    "A": ArmRule("distance, 8 attempts", "distance", 2, 4),
+    "B": ArmRule("recall, 8 attempts", "recall", 2, 4),
+    # All candidates, one after another, until one is believed.
+    "C": ArmRule("exhaustive", "distance", 1, UNLIMITED),
+    # Whatever matches is omitted, also what other drives rely on, as in [G16] §V-A.
+    "P": ArmRule("as A, every match omits", "distance", 2, 4, sure_inliers=0),
+    # The papers', with their settings.
+    AS_SET: ArmRule("as the settings say"),
+}
+# What arms other than `AS_SET` set themselves.
+_SET_BY_ARMS = (
+    ("drive", ("ranking", "lanes", "rounds")),
+    ("merge", ("ranking", "lanes", "rounds", "sure_inliers")),
+)
+
+
+def arms_for(settings: AllSettings) -> tuple[str, ...]:
+    """The arms to run by default: that of the settings where they set what arms would."""
+    usual = AllSettings()
+    changed = any(
+        getattr(getattr(settings, table), name) != getattr(getattr(usual, table), name)
+        for table, names in _SET_BY_ARMS
+        for name in names
+    )
+    return (AS_SET,) if changed else USUAL_ARMS
+
 
 EXPERIMENTS = (7, 8, 9, 10)
 # Raise it whenever maps are merged otherwise, or more is recorded of maps and merges: studies of
@@ -215,3 +314,91 @@ def _spread(drives: Sequence[EvaluatedDrive], count: int) -> list[EvaluatedDrive
     """So many of the drives, evenly over them."""
     rows = np.floor((np.arange(count) + 0.5) * len(drives) / count).astype(int)
     return [drives[row] for row in rows]
+
+
+@dataclass(frozen=True, slots=True)
+class MergeRecord:
+    """One merge into a centre.
+
+    Attributes:
+        name: of the map handed in.
+        nodes: of the centre afterwards.
+        components: connected components of the centre afterwards.
+        taken, omitted: nodes.
+        frames: nodes that were replayed.
+        attempts, proposed, lookups: match attempts, those of them at proposed nodes, and nodes for
+            which the relocaliser was asked.
+        seconds: wall time.
+        in_force: what the centre keeps of how it was made.
+    """
+
+    name: str
+    nodes: int
+    components: int
+    taken: int
+    omitted: int
+    frames: int
+    attempts: int
+    proposed: int
+    lookups: int
+    seconds: float
+    in_force: Values = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class DownloadRecord:
+    """One download for a foray.
+
+    Attributes:
+        policy: key of `SELECTIONS`; another than was asked for where nothing was driven at that
+            hour.
+        start_h: hour of day that it was made for; None if it is not known.
+        nodes, of_nodes: sent, and of the centre.
+        united: sent, together with what the robot itself had saved and the centre knows.
+        size_bytes, of_bytes: of the file, and of the centre's.
+        in_force: what the file keeps of how it was made.
+    """
+
+    policy: str
+    start_h: float | None
+    nodes: int
+    of_nodes: int
+    united: int
+    size_bytes: int
+    of_bytes: int
+    in_force: Values = field(default_factory=dict)
+
+
+def write_record(path: Path, record: Any) -> None:
+    """Writes a dataclass."""
+    write_json(path, to_dict(record))
+
+
+def read_json(path: Path) -> Any:
+    """What `write_record` wrote, as plain values."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def read_merge(path: Path) -> MergeRecord | None:
+    """What a merge came to; None if it is still to be done."""
+    return MergeRecord(**read_json(path)) if path.exists() else None
+
+
+def read_download(path: Path) -> DownloadRecord | None:
+    """What a download came to; None if it is still to be done."""
+    return DownloadRecord(**read_json(path)) if path.exists() else None
+
+
+def write_drive(path: Path, drive: Drive, frame_ms: list[float]) -> None:
+    """How a drive went in the field: in one step."""
+    draft = path.with_name(f".{path.name}.part.npz")
+    np.savez_compressed(draft, step_m=drive.step_m, matched=drive.matched, frame_ms=frame_ms)
+    draft.replace(path)
+
+
+def read_drive(path: Path) -> tuple[Drive, float] | None:
+    """How a drive went in the field, and mean ms of localising a frame; None if it did not yet."""
+    if not path.exists():
+        return None
+    with np.load(path) as kept:
+        return Drive(kept["step_m"], kept["matched"]), float(kept["frame_ms"].mean())

@@ -13,24 +13,32 @@ from typing import Any, TypeAlias
 from engram.measures import Drive
 from engram_lab.studies.building import BuiltSession, read_record
 from engram_lab.studies.configurations import Configuration
-from engram_lab.studies.drives import EvaluatedDrive
-from engram_lab.studies.fleet.arms import Arm
+from engram_lab.studies.drives import EvaluatedDrive, Fold
 from engram_lab.studies.fleet.experiments import merged_name, pair_merges
-from engram_lab.studies.fleet.plan import FORAY_POLICIES, ROBOTS, FleetPlan
-from engram_lab.studies.fleet.records import (
+from engram_lab.studies.fleet.plan import (
+    FORAY_POLICIES,
+    ROBOTS,
+    Arm,
     DownloadRecord,
+    FleetPlan,
     MergeRecord,
     read_download,
     read_drive,
     read_json,
     read_merge,
 )
-from engram_lab.studies.fleet.stages import Counts, StageTimes, read_stages
-from engram_lab.studies.fleet.steps import field_path, map_path, runs_path
-from engram_lab.studies.fleet.trials import TriedDownload, read_trials
-from engram_lab.studies.folds import Fold
+from engram_lab.studies.fleet.steps import (
+    Counts,
+    StageTimes,
+    TriedDownload,
+    field_path,
+    map_path,
+    read_stages,
+    read_trials,
+    runs_path,
+)
 from engram_lab.studies.in_force import Values, common
-from engram_lab.studies.store import read_runs
+from engram_lab.studies.lockstep import read_runs
 from engram_lab.studies.summary import ConfigurationResult, SessionResult, session_result
 
 

@@ -1,0 +1,306 @@
+"""Who may do what: roles on a map, enrolment of robots, tokens that live for minutes.
+
+Robots enrol with a one-time code and a key pair of their own; tokens live for minutes. A robot
+proves who it is by signing a nonce of the centre: its clock plays no part.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from sqlalchemy import Connection, delete, select, update
+
+from engram.centre.database import (
+    codes,
+    first_row,
+    grants,
+    nonces,
+    note,
+    robots,
+    rows_of,
+    subjects,
+    tokens,
+)
+from engram.centre.errors import NotAllowedError, NotKnownError, UnknownError
+from engram.centre.fleet import check_followed
+from engram.centre.service import DAY_NS, Centre
+from engram.errors import InputError
+from engram.transfers import check_signature, enrolment_text, token_text
+
+ALL_MAPS = "*"
+
+
+class Role(StrEnum):
+    """Role of a person or robot on a map."""
+
+    VIEWER = "viewer"  # reads the map, its history and the state of the fleet
+    ROBOT = "robot"  # downloads, its own hand-ins and reports
+    OPERATOR = "operator"  # moves refs, reverts, merges what a gate refused, cancels
+    ADMIN = "admin"  # enrols robots, sets a map's options
+
+
+# Roles that may do what a role may.
+_INCLUDES: Mapping[Role, frozenset[Role]] = {
+    Role.VIEWER: frozenset({Role.VIEWER, Role.OPERATOR, Role.ADMIN}),
+    Role.ROBOT: frozenset({Role.ROBOT}),
+    Role.OPERATOR: frozenset({Role.OPERATOR, Role.ADMIN}),
+    Role.ADMIN: frozenset({Role.ADMIN}),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """The caller of a request.
+
+    Attributes:
+        id: of the robot or person.
+        name: for people.
+        roles: by map; `ALL_MAPS` for every map.
+    """
+
+    id: str
+    name: str
+    roles: Mapping[str, Role]
+
+    def role_on(self, name: str) -> Role | None:
+        """The role on a map; None without one."""
+        return self.roles.get(name, self.roles.get(ALL_MAPS))
+
+    def check(self, name: str, *roles: Role) -> None:
+        """Refuses who has none of the roles on a map.
+
+        Raises:
+            UnknownError: no role at all: that the map exists is not revealed.
+            NotAllowedError: another role.
+        """
+        role = self.role_on(name)
+        if role is None:
+            raise UnknownError(f"you have no access to a map {name!r:.60}")
+        if not any(role in _INCLUDES[one] for one in roles):
+            raise NotAllowedError(
+                f"a role of {role} may not do this; it needs {' or '.join(roles)}"
+            )
+
+
+_S = 1_000_000_000
+
+
+def new_code(centre: Centre, name: str, follows: str, by: str) -> str:
+    """A code with which one robot enrols on a map.
+
+    Raises:
+        InputError: no ref can be called what the robot is to follow.
+    """
+    centre.map_path(name)
+    check_followed(follows)
+    code = secrets.token_hex(12)  # on a command line: a first - would be an option
+    now = centre.now_ns()
+    with centre.database.writing() as connection:
+        row = {
+            "hash": _hash(code),
+            "map": name,
+            "follows": follows,
+            "expires_ns": now + centre.settings.code_days * DAY_NS,
+            "used_by": None,
+        }
+        centre.database.add(connection, codes, [row])
+        note(connection, now, by, "code", name, follows=follows)
+    return code
+
+
+def enrol(centre: Centre, code: str, name: str, public_key: bytes, signature: bytes) -> Subject:
+    """Enrols a robot; again with the same key it is the same robot, with its new name.
+
+    Raises:
+        NotAllowedError: the code is unknown, expired, or used by another robot, or the robot was
+            removed.
+        InputError: the signature is not of this key.
+    """
+    check_signature(public_key, signature, enrolment_text(code))
+    robot, now = hashlib.sha256(public_key).hexdigest()[:32], centre.now_ns()
+    with centre.database.writing() as connection:
+        row = first_row(connection, select(codes).where(codes.c.hash == _hash(code)))
+        gone = select(subjects.c.id).where(subjects.c.id == robot, subjects.c.disabled != 0)
+        if connection.execute(gone).first() is not None:
+            raise NotAllowedError("this robot was removed; enrol it again from a new folder")
+        if row is None or row["expires_ns"] < now or row["used_by"] not in {None, robot}:
+            raise NotAllowedError("the code is unknown, expired or used; ask for a new one")
+        if row["used_by"] is None:
+            connection.execute(
+                update(codes).where(codes.c.hash == row["hash"]).values(used_by=robot)
+            )
+            _add_robot(centre, connection, robot, name, public_key, row)
+            connection.execute(update(subjects).where(subjects.c.id == robot).values(name=name))
+            note(connection, now, robot, "enrol", row["map"], name=name)
+        return _subject(connection, robot)
+
+
+def _add_robot(
+    centre: Centre,
+    connection: Connection,
+    robot: str,
+    name: str,
+    public_key: bytes,
+    code: dict[str, object],
+) -> None:
+    known = {
+        "id": robot,
+        "kind": "robot",
+        "name": name,
+        "public_key": public_key,
+        "created_ns": centre.now_ns(),
+        "disabled": 0,
+    }
+    centre.database.add(connection, subjects, [known])
+    grant = {"subject": robot, "map": code["map"], "role": str(Role.ROBOT)}
+    centre.database.put(connection, grants, grant)
+    state = {
+        "robot": robot,
+        "map": code["map"],
+        "follows": code["follows"],
+        "report": "{}",
+        "reported_ns": None,
+    }
+    centre.database.add(connection, robots, [state])
+
+
+def new_nonce(centre: Centre, robot: str) -> str:
+    """A nonce that a robot must sign to get a token; given to unknown robots, too."""
+    nonce, now = secrets.token_hex(16), centre.now_ns()
+    with centre.database.writing(durable=False) as connection:
+        connection.execute(delete(nonces).where(nonces.c.expires_ns < now))
+        known = first_row(connection, select(subjects.c.id).where(subjects.c.id == robot))
+        if known is not None:
+            expires_ns = now + centre.settings.nonce_s * _S
+            row = {"nonce": nonce, "subject": robot, "expires_ns": expires_ns}
+            centre.database.add(connection, nonces, [row])
+    return nonce
+
+
+def new_token(centre: Centre, robot: str, nonce: str, signature: bytes) -> str:
+    """A token for a robot that signed a nonce.
+
+    Raises:
+        NotAllowedError: the nonce is unknown, used or expired, the robot is disabled, or the
+            signature is not its.
+    """
+    now = centre.now_ns()
+    with centre.database.writing(durable=False) as connection:
+        query = select(nonces).where(nonces.c.nonce == nonce, nonces.c.subject == robot)
+        row = first_row(connection, query)
+        connection.execute(delete(nonces).where(nonces.c.nonce == nonce))
+        known = first_row(connection, select(subjects).where(subjects.c.id == robot))
+    refused = NotAllowedError(
+        "no token: the robot is unknown here, was removed, or signed an expired nonce"
+    )
+    if row is None or row["expires_ns"] < now or known is None or known["disabled"]:
+        raise refused
+    try:
+        check_signature(known["public_key"] or b"", signature, token_text(robot, nonce))
+    except InputError as error:
+        raise refused from error
+    return _issue(centre, robot, now + centre.settings.token_s * _S)
+
+
+def add_person(centre: Centre, name: str, map_name: str, role: Role) -> str:
+    """A token for a person, without end; `engram centre token` makes them.
+
+    Raises:
+        UnknownError: there is no such map.
+        InputError: no name is given.
+    """
+    if not name.strip():
+        raise InputError("a token needs the name of a person: the audit log shows it")
+    if map_name != ALL_MAPS:
+        centre.map_row(map_name)
+    person, now = secrets.token_hex(16), centre.now_ns()
+    with centre.database.writing() as connection:
+        known = {
+            "id": person,
+            "kind": "person",
+            "name": name,
+            "public_key": None,
+            "created_ns": now,
+            "disabled": 0,
+        }
+        centre.database.add(connection, subjects, [known])
+        grant = {"subject": person, "map": map_name, "role": str(role)}
+        centre.database.put(connection, grants, grant)
+        note(connection, now, "shell", "token", map_name, name=name, role=str(role))
+    return _issue(centre, person, None)
+
+
+def subject_of(centre: Centre, token: str) -> Subject:
+    """The holder of a token.
+
+    Raises:
+        NotKnownError: the token is unknown, or has expired.
+    """
+    with centre.database.reading() as connection:
+        row = first_row(connection, select(tokens).where(tokens.c.hash == _hash(token)))
+        expired = row is not None and (row["expires_ns"] or 2**63) < centre.now_ns()
+        if row is None or expired:
+            raise NotKnownError("the token is not known or has expired; ask for a new one")
+        return _subject(connection, row["subject"])
+
+
+def disable(centre: Centre, robot: str, by: str) -> None:
+    """Revokes all tokens of a robot or person, and issues no more."""
+    with centre.database.writing() as connection:
+        connection.execute(update(subjects).where(subjects.c.id == robot).values(disabled=1))
+        connection.execute(delete(tokens).where(tokens.c.subject == robot))
+        note(connection, centre.now_ns(), by, "disable", "", robot=robot)
+
+
+def take_away(centre: Centre, name: str, by: str) -> list[str]:
+    """Revokes all tokens of every person of this name, or of the robot of this name or id.
+
+    Returns:
+        Their ids.
+
+    Raises:
+        UnknownError: no person or robot has this name.
+        InputError: several robots have it.
+    """
+    called = (subjects.c.name == name) | (subjects.c.id == name)
+    with centre.database.reading() as connection:
+        found = rows_of(connection, select(subjects).where(called, subjects.c.disabled == 0))
+    alike = [one["id"] for one in found if one["kind"] == "robot"]
+    if len(alike) > 1:
+        raise InputError(f"{len(alike)} robots are called {name!r}; name one by its id: {alike}")
+    if not found:
+        raise UnknownError(f"{name!r:.60} has no token")
+    for one in found:
+        disable(centre, one["id"], by)
+    return [one["id"] for one in found]
+
+
+def names_of(centre: Centre) -> dict[str, str]:
+    """Names of all robots and people, by id."""
+    with centre.database.reading() as connection:
+        return {row["id"]: row["name"] for row in rows_of(connection, select(subjects))}
+
+
+def _issue(centre: Centre, subject: str, expires_ns: int | None) -> str:
+    token = secrets.token_urlsafe(32)
+    with centre.database.writing(durable=expires_ns is None) as connection:
+        connection.execute(delete(tokens).where(tokens.c.expires_ns < centre.now_ns()))
+        row = {"hash": _hash(token), "subject": subject, "expires_ns": expires_ns}
+        centre.database.add(connection, tokens, [row])
+    return token
+
+
+def _subject(connection: Connection, found: str) -> Subject:
+    row = first_row(connection, select(subjects).where(subjects.c.id == found))
+    if row is None or row["disabled"]:
+        raise NotKnownError("the owner of this token is no longer known; ask for a new one")
+    held = rows_of(connection, select(grants).where(grants.c.subject == found))
+    return Subject(found, row["name"], {one["map"]: Role(one["role"]) for one in held})
+
+
+def _hash(secret: str) -> bytes:
+    return hashlib.sha256(secret.encode()).digest()

@@ -1,0 +1,388 @@
+"""One hand-in into the fleet map: checked in a process with limits, never twice, never lost.
+
+The row says `complete` until the outcome is known. A worker that dies leaves it so, and the next
+one merges again: what was committed is found by the content hash that its revision names.
+
+Admission: what a robot handed in becomes a checked map, in a process with limits. The centre never
+opens a file of a robot: it writes one of its own, from pages whose rows have exactly the types of
+its tables, and verifies every record of it before anything else reads it.
+
+A hand-in in a process of its own, so that none can end the worker. Whatever is raised in it ends
+that hand-in, and so does its death: by a fault of memory, or by a system that is out of it. It is
+not tried again until an operator asks for that.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import multiprocessing
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any
+
+from engram.centre.errors import MissingPartsError, StoreError
+from engram.centre.fleet import Refs
+from engram.centre.handins import HandIns, Parts
+from engram.centre.service import Centre, CentreSettings, HandInState, MapPolicy
+from engram.counts import counted
+from engram.errors import (
+    EngramError,
+    MapCorruptError,
+    MapLockedError,
+    RefusedError,
+    SequenceError,
+    StorageFullError,
+    WorkerError,
+)
+from engram.fleet.merge.merging import merge
+from engram.fleet.merge.report import MergeReport
+from engram.logs import logging_to_stderr
+from engram.maps.map import Map
+from engram.monitor import Monitor
+from engram.places.words import problems_of
+from engram.processes import end_with_parent
+from engram.robot.settings import Settings
+from engram.transfers import Manifest, PartHash, join
+
+_NEW_USER, _NEW_NETWORK = 0x10000000, 0x40000000
+_SHOWN_PROBLEMS = 5
+
+
+class KilledError(WorkerError):
+    """Something killed the process that checks a map."""
+
+
+def admit(
+    manifest: Manifest, parts: dict[PartHash, bytes], path: Path, memory_bytes: int, time_s: int
+) -> None:
+    """Writes the thin map of a hand-in and checks it.
+
+    Args:
+        manifest: what was handed in.
+        parts: pages, and the blobs that merging reads.
+        path: the file to write.
+        memory_bytes: that the process may take, beyond what the parts take.
+        time_s: processor time that it may take.
+
+    Raises:
+        MapCorruptError: the parts make no sound map.
+        StorageFullError: there is no room for it now.
+        KilledError: something else than the limits ended the process.
+        WorkerError: the limits ended it.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    pipe, theirs = context.Pipe()
+    size = sum(map(len, parts.values()))
+    limits = (memory_bytes + 3 * size, time_s, 3 * size + 2**26)
+    process = context.Process(target=_admit_confined, args=(theirs, limits), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        pipe.send((manifest, parts, path))
+        outcome = pipe.recv()
+    except (EOFError, OSError):
+        process.join()
+        if process.exitcode == -signal.SIGKILL:  # limits end it in other ways
+            raise KilledError(
+                "the check of the map was killed, as by a system that is out of memory"
+            ) from None
+        raise WorkerError(
+            f"the map took more than {memory_bytes} bytes or {time_s} s to check, exit code "
+            f"{process.exitcode}"
+        ) from None
+    finally:
+        pipe.close()
+    process.join()
+    if isinstance(outcome, EngramError):
+        raise outcome
+
+
+def _admit_confined(pipe: Connection, limits: tuple[int, int, int]) -> None:
+    """Main function of the process."""
+    end_with_parent()
+    manifest, parts, path = pipe.recv()
+    confine(*limits)
+    outcome: EngramError | None = None
+    try:
+        write_checked(manifest, parts, path)
+    except StorageFullError as error:
+        outcome = error
+    except EngramError as error:
+        outcome = MapCorruptError(str(error))
+    pipe.send(outcome)
+
+
+def write_checked(manifest: Manifest, parts: dict[PartHash, bytes], path: Path) -> None:
+    """Main function of the process: joins the parts, and verifies every record.
+
+    Raises:
+        MapCorruptError: the parts make no sound map.
+    """
+    join(manifest, parts.get, path, thin=True)
+    problems = problems_of(path, thin=True)
+    if problems:
+        shown = "; ".join(map(str, problems[:_SHOWN_PROBLEMS]))
+        raise MapCorruptError(f"{len(problems)} faults: {shown}")
+
+
+def confine(memory_bytes: int, time_s: int, file_bytes: int) -> None:
+    """Limits this process permanently, and cuts off its network where the system allows."""
+    _lower(resource.RLIMIT_AS, memory_bytes, memory_bytes)
+    _lower(resource.RLIMIT_CPU, time_s, time_s + 5)
+    _lower(resource.RLIMIT_FSIZE, file_bytes, file_bytes)
+    _lower(resource.RLIMIT_CORE, 0, 0)
+    ctypes.CDLL(None).unshare(_NEW_USER | _NEW_NETWORK)
+    os.nice(5)
+
+
+def _lower(kind: int, soft: int, hard: int) -> None:
+    """Sets a limit; one that the system has set lower stays, since it cannot be raised."""
+    most = resource.getrlimit(kind)[1]
+    if most != resource.RLIM_INFINITY:
+        soft, hard = min(soft, most), min(hard, most)
+    resource.setrlimit(kind, (soft, hard))
+
+
+_TELL_S = 1.0
+
+
+class Watching(Monitor):
+    """Reports the progress of a job, and stops it if it is cancelled.
+
+    Args:
+        tell: notes the progress; returns whether the job is to be cancelled.
+    """
+
+    def __init__(self, tell: Callable[[str], bool]) -> None:
+        self._tell = tell
+        self._told_s = 0.0
+        self._what, self._total, self._done = "", 0, 0
+
+    @contextmanager
+    def stage(self, what: str, total: int) -> Iterator[Monitor]:
+        """See `Monitor`."""
+        self._what, self._total, self._done = what.split(" /", 1)[0], total, 0
+        yield self
+
+    def advance(self, word: str = "") -> None:
+        """See `Monitor`."""
+        del word
+        self._done += 1
+
+    def check(self) -> None:
+        """See `Monitor`."""
+        now = time.monotonic()
+        if now - self._told_s < _TELL_S:
+            return
+        self._told_s = now
+        if self._tell(f"{self._what}: {self._done} of {self._total}"):
+            raise KeyboardInterrupt
+
+
+_log = logging.getLogger(__name__)
+# A held-out drive that cannot be read is a SequenceError: robots hand in no drives.
+_OF_THE_CENTRE = (StorageFullError, StoreError, MapLockedError, SequenceError)
+
+
+class WaitsError(EngramError):
+    """A hand-in waits for the centre."""
+
+
+def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
+    """Merges one complete hand-in.
+
+    Raises:
+        EngramError: what lies with the centre, and not with the hand-in, which waits: no space, a
+            map that is being written to, a held-out drive that is gone.
+    """
+    handins = HandIns(centre)
+    if row["tries"] >= centre.settings.merge_tries:
+        tries = counted(row["tries"], "time")
+        fact = f"its worker died {tries}; an operator may have it merged anyway"
+        clear_scratch(centre, row)
+        handins.end(row, HandInState.FAILED, error=fact)
+        return
+    handins.begun(row)
+    begun_s = time.monotonic()
+    thin = _thin_map(centre, row)
+    try:
+        with _scratch(thin):
+            _admit(centre, row, thin)
+            outcome = _merged(centre, handins, row, thin)
+    except MissingPartsError:  # the map changed since they were asked for, by a revert
+        handins.end(row, HandInState.OPEN)
+    except RefusedError as error:
+        handins.end(row, HandInState.REFUSED, error=centre.words_of(error))
+    except KilledError as error:  # this try counts: the map may be what takes the memory
+        raise WaitsError(f"{row['map']}: hand-in {row['id'][:8]} waits: {error}") from error
+    except (*_OF_THE_CENTRE, OSError) as error:
+        fact = centre.words_of(error)
+        handins.put_off(row, fact)
+        raise WaitsError(f"{row['map']}: hand-in {row['id'][:8]} waits: {fact}") from error
+    except KeyboardInterrupt:
+        if not handins.get(row["id"])["cancelled"]:
+            raise
+        handins.end(row, HandInState.CANCELLED, error="cancelled")
+    except EngramError as error:
+        handins.end(row, HandInState.FAILED, error=centre.words_of(error))
+    except Exception as error:  # a stranger's map may bring about any: it ends this hand-in alone
+        _log.exception("%s: hand-in %s", row["map"], row["id"][:8])
+        fact = f"an unexpected fault, {centre.fault_of(error)}"
+        handins.end(row, HandInState.FAILED, error=fact)
+    else:
+        _settle(centre, handins, row, outcome)
+        took_s = time.monotonic() - begun_s
+        _log.info("%s: hand-in %s took %.1f s of work", row["map"], row["id"][:8], took_s)
+
+
+def _admit(centre: Centre, row: dict[str, Any], thin: Path) -> None:
+    parts, limits = Parts(centre), centre.settings
+    manifest = parts.manifest(row)
+    admit(
+        manifest,
+        parts.source(row, manifest),
+        thin,
+        limits.admission_bytes,
+        limits.admission_s,
+    )
+
+
+def _merged(centre: Centre, handins: HandIns, row: dict[str, Any], thin: Path) -> MergeReport:
+    policy = centre.policy(row["map"])
+    (report,) = merge(
+        centre.map_path(row["map"]),
+        [thin],
+        policy.merge,
+        Watching(partial(handins.heartbeat, row["id"])),
+        settings=Settings(),
+        require_better=[] if row["ungated"] else [Path(one) for one in policy.gate],
+    )
+    return report
+
+
+def _settle(centre: Centre, handins: HandIns, row: dict[str, Any], report: MergeReport) -> None:
+    if report.interrupted:
+        handins.end(row, HandInState.CANCELLED, error="cancelled")
+        return
+    told = {**report.to_dict(), "source": f"hand-in {row['id']}"}
+    revision = report.revision
+    if revision is None:  # nothing new; or a worker died between the merge and this row
+        revision = _revision_of(centre.map_path(row["map"]), row["content_hash"])
+        report.revision = revision
+    handins.end(row, HandInState.MERGED, revision=revision, report=told)
+    policy: MapPolicy = centre.policy(row["map"])
+    if policy.moves is not None and revision and not row["ungated"]:
+        Refs(centre).move(row["map"], policy.moves, revision, "gate", None)
+
+
+def _revision_of(path: Path, content_hash: str) -> int:
+    """The revision that holds a map of this content: the one that merged it, or the newest."""
+    with Map.open(path) as store:
+        for one in store.log():
+            merged = one.configuration.get("merge")
+            if isinstance(merged, dict) and merged.get("source") == content_hash:
+                return one.number
+        return store.revision
+
+
+def clear_scratch(centre: Centre, row: dict[str, Any]) -> None:
+    """Removes what a killed merge of a hand-in left next to the maps."""
+    _clear(_thin_map(centre, row))
+
+
+def _thin_map(centre: Centre, row: dict[str, Any]) -> Path:
+    return centre.folder / "work" / f"{row['id']}.engram"
+
+
+@contextmanager
+def _scratch(path: Path) -> Iterator[None]:
+    """Removes what a file and its locks leave, before and after."""
+    _clear(path)
+    try:
+        yield
+    finally:
+        _clear(path)
+
+
+def _clear(path: Path) -> None:
+    for one in path.parent.glob(f"{path.name}*"):
+        one.unlink()
+
+
+# Chosen first by a system that is out of memory, before the worker and the service.
+_FIRST_TO_GO = "1000"
+
+
+def merge_apart(centre: Centre, row: dict[str, Any]) -> None:
+    """Merges one complete hand-in, as `merge_hand_in` does.
+
+    Raises:
+        WaitsError: it waits for the centre.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    pipe, theirs = context.Pipe(duplex=False)
+    given = (theirs, centre.folder, centre.addresses, centre.settings, row["id"])
+    process = context.Process(target=_merge, args=given)
+    process.start()
+    theirs.close()
+    try:
+        waits_for = _told(pipe)
+    except BaseException:
+        process.kill()
+        raise
+    finally:
+        pipe.close()
+        process.join()
+    if waits_for:
+        raise WaitsError(waits_for)
+    if HandIns(centre).get(row["id"])["state"] == HandInState.COMPLETE:
+        _end_killer(centre, row, process)
+
+
+def _told(pipe: Connection) -> str:
+    """What the hand-in waits for; empty if it has ended, or its process."""
+    try:
+        waits_for: str = pipe.recv()
+    except (EOFError, OSError):
+        return ""
+    return waits_for
+
+
+def _end_killer(centre: Centre, row: dict[str, Any], process: BaseProcess) -> None:
+    """Ends a hand-in whose process died."""
+    code = process.exitcode or 0
+    how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
+    fact = f"the process that merged it ended {how}; an operator may have it merged anyway"
+    _log.error("%s: hand-in %s: %s", row["map"], row["id"][:8], fact)
+    clear_scratch(centre, row)
+    HandIns(centre).end(row, HandInState.FAILED, error=fact)
+
+
+def _merge(
+    pipe: Connection,
+    folder: Path,
+    addresses: tuple[str | None, str | None],
+    settings: CentreSettings,
+    key: str,
+) -> None:
+    """Main function of the process: sends what the hand-in waits for, nothing if it has ended."""
+    end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker ends it
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO)
+    with logging_to_stderr(), Centre(folder, *addresses, settings) as centre:
+        try:
+            merge_hand_in(centre, HandIns(centre).get(key))
+        except (EngramError, OSError) as error:
+            pipe.send(centre.words_of(error))

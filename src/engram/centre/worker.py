@@ -1,0 +1,361 @@
+"""The loop of a worker: hand-ins, downloads, dreams, and the removal of what nothing needs.
+
+Removes packs whose parts no hand-in and no download needs any more. Kept are the parts of hand-ins
+that are under way or refused, of those that ended lately, of each robot's newest merged one, which
+its next one continues, and of downloads. What was swept is requested again where it is needed
+again: `wanted` lists it, as no robot counts as having sent it.
+
+Dreams, when nothing else is to do: given up for whatever a robot hands in or asks for. A dream runs
+in a process of its own at low priority, which may be killed at any moment: what was tried is kept
+next to the map, and the next one continues from there.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import shutil
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from sqlalchemy import select
+
+from engram.centre.database import artifacts, note, packs
+from engram.centre.errors import StoreError
+from engram.centre.fleet import Refs
+from engram.centre.handins import HandIns
+from engram.centre.jobs import Downloads, Dreams
+from engram.centre.merging import WaitsError, Watching, admit, merge_apart
+from engram.centre.objects import written_ns
+from engram.centre.service import (
+    ASKED,
+    CANCELLED,
+    DAY_NS,
+    DONE,
+    FAILED,
+    Centre,
+    kept_since_ns,
+    manifest_key,
+    needed_manifests,
+)
+from engram.errors import EngramError, MapCorruptError, MapLockedError, StorageFullError
+from engram.fleet.dream import DreamOptions, dream
+from engram.maps.map import Map
+from engram.processes import end_with_parent
+from engram.robot.settings import Settings
+from engram.transfers import PartHash, blobs_named, decode_manifest
+
+# Parts of manifests, by the manifest's hash.
+_Marks: TypeAlias = dict[str, set[PartHash]]
+
+
+def sweep_all(centre: Centre) -> None:
+    """Sweeps every map that no other worker has; what hinders it is noted, and harms no hand-in."""
+    for name in centre.map_names():
+        with centre.lane(name) as is_ours:
+            try:
+                if is_ours:
+                    sweep(centre, name)
+            except EngramError as error:
+                with centre.database.writing() as connection:
+                    told = str(error)
+                    note(connection, centre.now_ns(), "worker", "sweep-failed", name, error=told)
+
+
+def sweep(centre: Centre, name: str) -> int:
+    """Removes the packs of one map that nothing needs, and empties those that little is needed of.
+
+    Uploads and downloads may continue: what is needed is looked up again in the transaction that
+    forgets packs, and whoever stores parts looks in his whether those he found are still there.
+    What was forgotten is deleted by the next sweep, so that readers and backups that looked before
+    still find it.
+
+    Args:
+        centre: the centre.
+        name: of the map.
+
+    Returns:
+        Bytes of the packs that are forgotten.
+    """
+    _delete_forgotten(centre, name)
+    limit_ns, store = kept_since_ns(centre), centre.packs(name)
+    marks: _Marks = {}
+    with centre.database.reading() as connection:
+        manifests = needed_manifests(connection, name, limit_ns)
+    _mark(centre, name, manifests, marks)
+    with centre.database.writing() as connection:
+        making = select(artifacts.c.id).where(artifacts.c.map == name, artifacts.c.state == ASKED)
+        if connection.execute(making).first() is not None:
+            return 0  # its parts are found or stored now, and not yet named by a manifest
+        manifests = needed_manifests(connection, name, limit_ns)
+        _mark(centre, name, manifests, marks)
+        needed = set[PartHash]().union(*(marks[one] for one in manifests))
+        gone = store.little_needed(connection, needed, limit_ns)
+        size = sum(store.forget(connection, pack, kept, centre.now_ns()) for pack, kept in gone)
+        if gone:
+            note(connection, centre.now_ns(), "worker", "sweep", name, packs=len(gone), bytes=size)
+    return size
+
+
+def _mark(centre: Centre, name: str, manifests: Iterable[str], marks: _Marks) -> None:
+    """Adds the parts of manifests that are not marked yet, as far as they are there."""
+    store = centre.packs(name)
+    for one in manifests:
+        if one in marks:
+            continue
+        manifest = decode_manifest(centre.objects.get(manifest_key(name, one)))
+        pages = dict(store.read(dict.fromkeys(manifest.hashes())))
+        marks[one] = set(pages)
+        here = {
+            table: tuple(page for page in some if page in pages)
+            for table, some in manifest.pages.items()
+        }
+        with suppress(MapCorruptError):  # a stranger's page: its hand-in fails by itself
+            for _, _, blobs in blobs_named(replace(manifest, pages=here), pages.get):
+                marks[one].update(blobs)
+
+
+def _delete_forgotten(centre: Centre, name: str) -> None:
+    """Deletes packs that no row names: forgotten by the sweep before, or left by a kill."""
+    limit_ns = min(kept_since_ns(centre), centre.now_ns() - DAY_NS)
+    keys = [key.rsplit("/", 1)[1] for key in centre.objects.keys(f"packs/{name}")]
+    with centre.database.reading() as connection:
+        known = set(connection.execute(select(packs.c.id).where(packs.c.map == name)).scalars())
+    for one in keys:
+        if one not in known and written_ns(one) <= limit_ns:
+            centre.objects.delete(f"packs/{name}/{one}")
+
+
+_NICENESS = 10
+
+
+def dream_a_while(
+    centre: Centre,
+    wait: Callable[[float], object],
+    stopped: Callable[[], bool],
+    scheduler: str | None = None,
+) -> bool:
+    """Dreams the first dream that is due, until there is something else to do.
+
+    Args:
+        centre: the centre.
+        wait: see `work`.
+        stopped: see `work`.
+        scheduler: address of a Dask scheduler whose workers try; None to try here.
+
+    Returns:
+        Whether it dreamt.
+    """
+    dreams = Dreams(centre)
+    dreams.ask_quietly()
+    due = dreams.due()
+    _clear_left(centre, due)
+    for row in due:
+        with centre.lane(row["map"]) as is_ours:
+            if is_ours and not _is_asked_for(centre):
+                _dream_beside(centre, row, wait, stopped, scheduler)
+                return True
+    return False
+
+
+def _clear_left(centre: Centre, due: list[dict[str, Any]]) -> None:
+    """Removes what killed dreams left that will not be resumed: copies of all robots' maps."""
+    names = {f"dream-{row['id']}" for row in due}
+    for folder in (centre.folder / "work").glob("dream-*"):
+        if folder.name not in names:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _dream_beside(
+    centre: Centre,
+    row: dict[str, Any],
+    wait: Callable[[float], object],
+    stopped: Callable[[], bool],
+    scheduler: str | None,
+) -> None:
+    context = multiprocessing.get_context("spawn")
+    given = (centre.folder, *centre.addresses, row["id"], scheduler)
+    process = context.Process(target=_dream_here, args=given)
+    process.start()
+    gives_up = False
+    try:
+        while process.is_alive() and not gives_up:
+            wait(centre.settings.poll_s)
+            gives_up = stopped() or _is_asked_for(centre) or not Dreams(centre).is_due(row)
+    finally:
+        process.kill()
+        process.join()
+    if process.exitcode and not gives_up:
+        fact = f"its process ended with exit code {process.exitcode}"
+        Dreams(centre).end(row, FAILED, error=fact)
+
+
+def _is_asked_for(centre: Centre) -> bool:
+    """Whether robots wait for a worker."""
+    handins = HandIns(centre)
+    return bool(Downloads(centre).asked()) or any(map(handins.waiting, centre.map_names()))
+
+
+def _dream_here(
+    folder: Path, database: str | None, objects: str | None, key: str, scheduler: str | None
+) -> None:
+    """Main function of the process."""
+    end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker ends it
+    os.nice(_NICENESS)
+    with Centre(folder, database, objects) as centre:
+        dream_of(centre, Dreams(centre).get(key), scheduler)
+
+
+def dream_of(centre: Centre, row: dict[str, Any], scheduler: str | None = None) -> None:
+    """Runs one dream to its end, and records the result in its row.
+
+    A map that is being written to by hand, or a full disk, leaves the request pending.
+    """
+    dreams, policy = Dreams(centre), centre.policy(row["map"])
+    options = DreamOptions(scheduler=scheduler, merging=policy.merge)
+    drives = [Path(one) for one in policy.gate]
+    watching = Watching(partial(dreams.heartbeat, row["id"]))
+    path = centre.map_path(row["map"])
+    try:
+        with _scratch(centre.folder / "work" / f"dream-{row['id']}") as folder:
+            handed = list(_handed(centre, row["map"], folder))
+            report = dream(path, handed, drives, Settings(), options, watching)
+    except (MapLockedError, StorageFullError):
+        return
+    except KeyboardInterrupt:
+        dreams.end(row, CANCELLED, error="cancelled")
+        return
+    except EngramError as error:
+        dreams.end(row, FAILED, error=centre.words_of(error))
+        return
+    told = report.to_dict() | {"centre": row["map"]}
+    if report.added is None:
+        revision = _made_before(path, row["since"])
+    else:
+        revision, told["added"]["out"] = report.added.revision, row["map"]
+    dreams.end(row, DONE, revision=revision, report=told)
+    if policy.moves is not None and revision is not None:
+        Refs(centre).move(row["map"], policy.moves, revision, "dream", None)
+
+
+def _made_before(path: Path, since: int) -> int | None:
+    """The revision that this dream made before its process died; else None."""
+    with Map.open(path) as store:
+        made = [one.number for one in store.log() if one.message.startswith("dream: ")]
+    return max((one for one in made if one > since), default=None)
+
+
+def _handed(centre: Centre, name: str, folder: Path) -> Iterator[Path]:
+    """Robots' maps as they were handed in, oldest first."""
+    dreams, limits = Dreams(centre), centre.settings
+    for number, row in enumerate(dreams.handed(name)):
+        path, manifest = folder / f"{number:04}.engram", dreams.manifest(row)
+        parts = dreams.parts(row, manifest)
+        admit(manifest, parts, path, limits.admission_bytes, limits.admission_s)
+        yield path
+
+
+@contextmanager
+def _scratch(folder: Path) -> Iterator[Path]:
+    """An empty folder for the length of the block."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+_log = logging.getLogger(__name__)
+# A full disk takes a person: until then the same job is not tried four times a second.
+_AGAIN_S = 10.0
+_HOUR_NS = 3_600_000_000_000
+
+
+def work_off(centre: Centre, take: Callable[[Centre, dict[str, Any]], None] = merge_apart) -> int:
+    """Does what there is to do; returns the number of settled jobs.
+
+    Args:
+        centre: the centre.
+        take: merges a hand-in.
+
+    Raises:
+        EngramError: what hinders the centre; of each map, after all of them had their turn. Jobs
+            wait.
+    """
+    handins = HandIns(centre)
+    settled, hindered = 0, list[EngramError]()
+    handins.expire()
+    Downloads(centre).expire()
+    for name in centre.map_names():
+        if not handins.waiting(name):
+            continue
+        try:
+            with centre.lane(name) as is_ours:
+                for row in handins.waiting(name) if is_ours else ():
+                    settled += _make_downloads(centre, hindered)
+                    take(centre, row)
+                    settled += 1
+        except WaitsError as error:  # the next map may have its disk and its drives
+            hindered.append(error)
+    settled += _make_downloads(centre, hindered)
+    if hindered:
+        raise hindered[0]
+    return settled
+
+
+def work(
+    centre: Centre,
+    wait: Callable[[float], object],
+    stopped: Callable[[], bool],
+    scheduler: str | None = None,
+) -> None:
+    """Works until it is stopped.
+
+    Args:
+        centre: the centre.
+        wait: returns after some seconds, or sooner when there may be work.
+        stopped: whether to end.
+        scheduler: address of a Dask scheduler whose workers dream; None to dream here.
+    """
+    swept_ns = 0
+    while not stopped():
+        try:
+            if work_off(centre):
+                continue
+            if centre.now_ns() - swept_ns >= centre.settings.sweep_h * _HOUR_NS:
+                swept_ns = centre.now_ns()
+                sweep_all(centre)
+            if dream_a_while(centre, wait, stopped, scheduler):
+                continue
+        except (EngramError, OSError) as error:
+            _log.error("%s; tried again in %g s", centre.words_of(error), _AGAIN_S)
+            wait(_AGAIN_S)
+        except Exception:  # of what robots sent: the others' work goes on
+            _log.exception("an unexpected fault; tried again in %g s", _AGAIN_S)
+            wait(_AGAIN_S)
+        else:
+            wait(centre.settings.poll_s)
+
+
+def _make_downloads(centre: Centre, hindered: list[EngramError]) -> int:
+    """Makes the requested downloads unless something hinders it: merging may take less room."""
+    downloads, made = Downloads(centre), 0
+    for name in {row["map"] for row in downloads.asked()}:
+        with centre.lane(f"{name}.downloads") as is_ours:
+            for row in downloads.asked() if is_ours else ():  # again: others made some meanwhile
+                if row["map"] != name or hindered:
+                    continue
+                try:
+                    downloads.make(row)
+                    made += 1
+                except (StorageFullError, StoreError) as error:
+                    hindered.append(error)
+    return made

@@ -1,1 +1,0 @@
-"""Workers: they merge hand-ins and make downloads."""

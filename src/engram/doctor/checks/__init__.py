@@ -1,1 +1,0 @@
-"""What the doctor measures, one subject a file: evidence in, one number out."""
