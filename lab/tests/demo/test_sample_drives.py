@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-import engram.sample
+from engram.sample import drives
 from engram_lab.demo.sample_drives import PARTS, encoded, write_facts
 
-SHIPPED = Path(engram.sample.__file__).parent / "data"
+SHIPPED = Path(drives.__file__).parent / "data"
 
 
 @pytest.mark.parametrize("name", PARTS)
@@ -35,7 +35,7 @@ def test_images_are_those_of_the_program(name: str) -> None:
 
 
 def test_the_drives_that_ship_are_whole_and_small() -> None:
-    assert {one.name for one in engram.sample.DRIVES} == PARTS.keys()
+    assert {one.name for one in drives.DRIVES} == PARTS.keys()
     files = [one for one in SHIPPED.rglob("*") if one.is_file()]
     assert len([one for one in files if one.suffix == ".jpg"]) == 2 * 2 * 40
     assert sum(one.stat().st_size for one in files) < 6.5e6
