@@ -56,7 +56,7 @@ class AgentState:
         self._errors = SqliteFile(path, _FILE).errors
         with self._errors():
             self._connection = sqlite3.connect(
-                path, _FILE.busy_s, isolation_level=None, check_same_thread=False
+                path, timeout=_FILE.busy_s, isolation_level=None, check_same_thread=False
             )
             self._connection.execute("PRAGMA journal_mode=WAL")
             self._connection.execute("PRAGMA synchronous=FULL")
