@@ -64,9 +64,8 @@ def image(encoding: str, rows: np.ndarray, pad: int = 0) -> Any:
 
 
 def test_the_link_is_the_same_file() -> None:
-    assert (PACKAGE / "engram_bridge" / "link.py").resolve() == Path(
-        str(engram.live.link.__file__)
-    ).resolve()
+    ours = Path(str(engram.live.link.__file__))  # of an installed package, maybe
+    assert (PACKAGE / "engram_bridge" / "link.py").read_bytes() == ours.read_bytes()
 
 
 def test_it_runs_on_python_3_8() -> None:
