@@ -14,11 +14,11 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
-def keywords(**moved: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
+def keywords(**meant: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
     """Makes a function refuse unknown keywords with a `ConfigError` in place of a `TypeError`.
 
     Args:
-        **moved: former keywords, and the one that replaced each.
+        **meant: other words for a keyword, and the keyword for each.
     """
 
     def checked(function: Callable[_P, _T]) -> Callable[_P, _T]:
@@ -31,7 +31,7 @@ def keywords(**moved: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
         @wraps(function)
         def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
             for unknown in kwargs.keys() - known:
-                near = moved.get(unknown) or next(
+                near = meant.get(unknown) or next(
                     iter(difflib.get_close_matches(unknown, known, 1)), None
                 )
                 question = "" if near is None else f"did you mean {near}? "

@@ -272,7 +272,7 @@ class WrongPlace:
 
     Attributes:
         frame: number of the live frame.
-        outcome: what came of it.
+        outcome: of the attempt.
     """
 
     frame: int

@@ -45,7 +45,7 @@ class AgentState:
     """Facts, the outbox, parts that both sides have, and parts that have arrived.
 
     Args:
-        path: the file; made where there is none.
+        path: the file; created if missing.
 
     Raises:
         StorageFullError: of this and every method that writes: no space is left.

@@ -503,7 +503,7 @@ def _partner(path: Path) -> dict[str, Any]:
     """The entries of the file that belongs to this one.
 
     Raises:
-        CalibrationError: there is none.
+        CalibrationError: that file is missing.
     """
     partner = _partner_path(path)
     if partner is None:

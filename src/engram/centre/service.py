@@ -239,7 +239,7 @@ class Centre:
     """What every part of the service works on. A context manager.
 
     Args:
-        folder: the centre's; made where there is none.
+        folder: the centre's; created if missing.
         database: address of the database; None for SQLite in the folder.
         objects: address of the bucket; None for a folder in the folder.
         settings: limits and times.

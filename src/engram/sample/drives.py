@@ -47,7 +47,7 @@ def write_drives(folder: Path, monitor: Monitor = QUIET) -> None:
     """Writes the drives into a folder, each as a whole or not at all; those that are there stay.
 
     Args:
-        folder: made where there is none.
+        folder: created if missing.
         monitor: receives the progress, file by file.
 
     Raises:

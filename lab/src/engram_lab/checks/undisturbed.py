@@ -74,7 +74,7 @@ class Driven:
     Attributes:
         campaign, mapped, drive, start, kind, method, sure: what was driven, in which map, and how;
             frames that match with fewer inliers than `sure` were saved.
-        way: what came of it.
+        way: its result.
     """
 
     campaign: str

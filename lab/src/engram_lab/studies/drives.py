@@ -413,7 +413,7 @@ class KeptMaps:
         Raises:
             MapError: it cannot be read.
         """
-        # A map that was made anew stands in another file of the same name.
+        # A map that was made again is another file of the same name.
         file = path, path.stat().st_ino
         maps = self._files.setdefault(file, {})
         self._files.move_to_end(file)

@@ -296,10 +296,10 @@ _MEAN_DAYS_BETWEEN = 4.0  # per kind, town-wide
 class AlterationKind(Enum):
     """What happens."""
 
-    REPAINT = 0  # a front gets another tone, for good
+    REPAINT = 0  # a front is repainted, permanently
     SCAFFOLD = 1  # stands for weeks
-    FELLED = 2  # trees go, for good
-    NEW_SIGN = 3  # for good
+    FELLED = 2  # trees are felled, permanently
+    NEW_SIGN = 3  # permanently
 
 
 @dataclass(frozen=True, slots=True)

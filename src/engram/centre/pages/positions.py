@@ -19,7 +19,7 @@ _KEPT = 8
 @lru_cache(maxsize=_KEPT)
 def drawn(path: Path, version: str, revision: int) -> bytes:
     """The nodes of a revision as JSON, in the map frame; kept by version."""
-    del version  # names the revision for good; the number alone does not after a restore
+    del version  # names the revision permanently; after a restore the number alone does not
     with Map.open(path, at=revision) as store:
         points = store.frame.positions
         sessions = list(store.sessions.values())
