@@ -16,9 +16,9 @@ from tests.mapping_rig import localised, map_simulated
 from tests.synthetic_world import World, drive
 from tests.worlds import covariance_of, forward, make_edge
 
-from engram.cli.fleet import _judge, merging_of
 from engram.cli.options import Effort
 from engram.cli.settings import every_setting, read_settings
+from engram.fleet.cli.verbs import _judge, merging_of
 from engram.fleet.merge.report import Reason
 from engram.fleet.merge.settings import MergeOptions, SeedFrom, Unit
 from engram.geometry.se3 import SE3

@@ -15,7 +15,7 @@ _MOST_LINES, _MOST_PARAMETERS = 60, 8
 _LONG = {
     "cli/drive.py": {"live"},
     "cli/drives.py": {"localise"},
-    "cli/fleet.py": {"build", "download", "merge"},
+    "fleet/cli/verbs.py": {"build", "download", "merge"},
     "cli/localising.py": {"localise_and_print"},
 }
 _MANY_PARAMETERS = {
@@ -149,7 +149,7 @@ def test_functions_stay_short() -> None:
 def test_functions_take_few_parameters() -> None:
     many: dict[str, set[str]] = {}
     for file, function in _functions():
-        if len(_arguments(function)) > _MOST_PARAMETERS and not file.startswith("cli/"):
+        if len(_arguments(function)) > _MOST_PARAMETERS and "cli" not in Path(file).parts:
             many.setdefault(file, set()).add(function.name)
     assert many == _MANY_PARAMETERS
 

@@ -6,17 +6,17 @@ import httpx
 import pytest
 from tests.centre.conftest import Site, admit_here, drive
 
-from engram.agent.agent import Agent
-from engram.agent.link import CentreRefusedError, Unreachable, enrol
-from engram.agent.state import AgentSettings, AgentState
-from engram.centre import merging
-from engram.centre.serving import back_up
-from engram.cli.agent import _open, sync
 from engram.cli.options import PartlyDoneError
 from engram.config import load_toml
 from engram.errors import ConfigError, IncompatibleError, InputError, StorageFullError
+from engram.fleet.agent.agent import Agent
+from engram.fleet.agent.link import CentreRefusedError, Unreachable, enrol
+from engram.fleet.agent.state import AgentSettings, AgentState
+from engram.fleet.centre import merging
+from engram.fleet.centre.serving import back_up
+from engram.fleet.cli.agent_verbs import _open, sync
+from engram.fleet.transfers import Manifest, PartHash, encode_manifest, part_hash
 from engram.maps.map import Map
-from engram.transfers import Manifest, PartHash, encode_manifest, part_hash
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def test_a_folder_that_is_not_enrolled_is_named(tmp_path):
 
 
 def test_a_hand_in_of_more_parts_than_one_answer_names_is_sent_whole(site, monkeypatch):
-    monkeypatch.setattr("engram.centre.transfer_routes._WANTED_AT_ONCE", 3)
+    monkeypatch.setattr("engram.fleet.centre.transfer_routes._WANTED_AT_ONCE", 3)
     agent = site.robot("r1")
     drive(agent.live, "r1", 1_000, 10)
     agent.hand_in()
@@ -134,7 +134,7 @@ def test_a_hand_in_of_more_parts_than_one_answer_names_is_sent_whole(site, monke
 
 
 def test_a_download_of_more_parts_than_one_request_names_is_fetched_whole(site, monkeypatch):
-    monkeypatch.setattr("engram.agent.outbox._ASKED_AT_ONCE", 3)
+    monkeypatch.setattr("engram.fleet.agent.outbox._ASKED_AT_ONCE", 3)
     first, second = site.robot("r1"), site.robot("r2")
     drive(first.live, "r1", 1_000, 10)
     first.hand_in()
@@ -270,7 +270,7 @@ def test_a_certificate_that_is_not_trusted_names_what_can_be_done(tmp_path):
 
 
 def test_an_agent_that_runs_tells_what_it_does(site, caplog):
-    caplog.set_level("INFO", "engram.agent")
+    caplog.set_level("INFO", "engram.fleet.agent")
     first, second = site.robot("r1"), site.robot("r2")
     first.introduce()
     site.link.fates = ["lost"]
@@ -279,7 +279,7 @@ def test_an_agent_that_runs_tells_what_it_does(site, caplog):
     key = first.hand_in()[:12]
     site.settle()
     assert second.switch()
-    told = [record.getMessage() for record in caplog.records if "engram.agent" in record.name]
+    told = [record.getMessage() for record in caplog.records if "engram.fleet.agent" in record.name]
     assert told[0] == "robot r1 of map fleet at http://centre: runs version none, outbox 0"
     assert told[1] == "the centre cannot be reached: ConnectError('lost'); tried again in 1 s"
     assert told[2:4] == [f"hand-in {key}: sending", f"hand-in {key}: sent"]

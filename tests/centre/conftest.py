@@ -14,14 +14,14 @@ from fastapi.testclient import TestClient
 from sqlalchemy import create_engine, make_url, text
 from tests.maps.maps import begin, session, write_drive
 
-from engram.agent.agent import Agent
-from engram.agent.link import enrol
-from engram.centre import merging
-from engram.centre.access import Role, add_person, new_code
-from engram.centre.app import create_app
-from engram.centre.merging import write_checked
-from engram.centre.service import Centre, MapPolicy
-from engram.centre.worker import work_off
+from engram.fleet.agent.agent import Agent
+from engram.fleet.agent.link import enrol
+from engram.fleet.centre import merging
+from engram.fleet.centre.access import Role, add_person, new_code
+from engram.fleet.centre.app import create_app
+from engram.fleet.centre.merging import write_checked
+from engram.fleet.centre.service import Centre, MapPolicy
+from engram.fleet.centre.worker import work_off
 from engram.fleet.merge.settings import MergeOptions
 from engram.maps.map import Map, open_map
 

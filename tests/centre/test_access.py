@@ -13,15 +13,15 @@ import pytest
 import uvicorn
 from sqlalchemy import delete, insert
 
-from engram.agent.link import CentreRefusedError, enrol
-from engram.centre import serving
-from engram.centre.access import Role, add_person, disable, new_code, take_away
-from engram.centre.database import _hash, audit, first_broken
-from engram.centre.errors import UnknownError
-from engram.centre.fleet import Fleet
-from engram.centre.jobs import Dreams
-from engram.centre.serving import Listening, serve
 from engram.errors import ConfigError, InputError
+from engram.fleet.agent.link import CentreRefusedError, enrol
+from engram.fleet.centre import serving
+from engram.fleet.centre.access import Role, add_person, disable, new_code, take_away
+from engram.fleet.centre.database import _hash, audit, first_broken
+from engram.fleet.centre.errors import UnknownError
+from engram.fleet.centre.fleet import Fleet
+from engram.fleet.centre.jobs import Dreams
+from engram.fleet.centre.serving import Listening, serve
 
 from .conftest import NAME, POLICY, drive
 
@@ -98,7 +98,7 @@ BODIES = {
 @pytest.fixture(scope="module")
 def used(tmp_path_factory):
     """A centre with a map that was handed in and asked for, and everybody's tokens."""
-    from engram.centre import merging
+    from engram.fleet.centre import merging
 
     from .conftest import Site, admit_here
 
@@ -113,7 +113,7 @@ def used(tmp_path_factory):
     with site.centre.database.writing() as connection:
         from sqlalchemy import update
 
-        from engram.centre.database import grants
+        from engram.fleet.centre.database import grants
 
         connection.execute(
             update(grants)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from sqlalchemy import update
 
-from engram.centre import serving
-from engram.centre.database import handins, maps
-from engram.centre.fleet import Refs
-from engram.centre.service import Centre
-from engram.centre.serving import back_up
 from engram.errors import InputError, StorageFullError
+from engram.fleet.centre import serving
+from engram.fleet.centre.database import handins, maps
+from engram.fleet.centre.fleet import Refs
+from engram.fleet.centre.service import Centre
+from engram.fleet.centre.serving import back_up
 from engram.maps.map import Map
 from engram.maps.map_files import copy_map
 

@@ -8,8 +8,8 @@ import threading
 import pytest
 import uvicorn
 
-from engram.centre.app import create_app
-from engram.centre.fleet import Fleet, Refs
+from engram.fleet.centre.app import create_app
+from engram.fleet.centre.fleet import Fleet, Refs
 from engram.maps.map import Map
 
 from .conftest import NAME, drive

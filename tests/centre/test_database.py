@@ -9,8 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from sqlalchemy import select
 
-from engram.centre.database import ServiceDatabase, usage
 from engram.errors import MapError
+from engram.fleet.centre.database import ServiceDatabase, usage
 
 THREADS = 8
 

@@ -17,14 +17,14 @@ from sqlalchemy import inspect, text
 from tests.fleet.test_dreaming import ASKED as USUAL
 from tests.fleet.test_dreaming import nodes_of, town
 
-from engram.centre import merging, worker
-from engram.centre.database import dreams
-from engram.centre.errors import ConflictError
-from engram.centre.handins import HandIns
-from engram.centre.jobs import Dreams
-from engram.centre.service import Centre, MapPolicy
-from engram.centre.worker import dream_a_while
 from engram.errors import WorkerError
+from engram.fleet.centre import merging, worker
+from engram.fleet.centre.database import dreams
+from engram.fleet.centre.errors import ConflictError
+from engram.fleet.centre.handins import HandIns
+from engram.fleet.centre.jobs import Dreams
+from engram.fleet.centre.service import Centre, MapPolicy
+from engram.fleet.centre.worker import dream_a_while
 from engram.fleet.dream import DreamReport
 from engram.maps.map import Map
 from engram.maps.map_files import check_file, copy_map

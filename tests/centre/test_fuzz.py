@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from engram.centre.access import Role
-from engram.centre.app import create_app
-from engram.centre.jobs import Dreams
+from engram.fleet.centre.access import Role
+from engram.fleet.centre.app import create_app
+from engram.fleet.centre.jobs import Dreams
 from engram.maps.map import Map
 
 from .conftest import NAME, POLICY, Site, admit_here, drive
@@ -28,7 +28,7 @@ TAKES_THE_ROBOT = "DELETE /v1/maps/{name}/robots/{robot}"  # that the others ask
 @pytest.fixture(scope="module")
 def used(tmp_path_factory):
     """A centre with a robot, a hand-in, a download and a dream; what places in paths can name."""
-    from engram.centre import merging
+    from engram.fleet.centre import merging
 
     patch = pytest.MonkeyPatch()
     patch.setattr(merging, "admit", admit_here)

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from sqlalchemy import create_engine, text
 
-from engram.centre import jobs, merging, worker
-from engram.centre.database import _errors
-from engram.centre.handins import HandIns
-from engram.centre.merging import KilledError
-from engram.centre.service import Centre
 from engram.errors import EngramError, MapCorruptError, StorageFullError
+from engram.fleet.centre import jobs, merging, worker
+from engram.fleet.centre.database import _errors
+from engram.fleet.centre.handins import HandIns
+from engram.fleet.centre.merging import KilledError
+from engram.fleet.centre.service import Centre
 
 from .conftest import NAME, POLICY, drive
 

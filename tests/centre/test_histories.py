@@ -11,11 +11,11 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
-from engram.centre import merging
-from engram.centre.handins import HandIns
-from engram.centre.service import CentreSettings, HandInState
-from engram.centre.serving import back_up
-from engram.centre.worker import sweep
+from engram.fleet.centre import merging
+from engram.fleet.centre.handins import HandIns
+from engram.fleet.centre.service import CentreSettings, HandInState
+from engram.fleet.centre.serving import back_up
+from engram.fleet.centre.worker import sweep
 from engram.fleet.merge.merging import merge
 from engram.maps.map import Map
 from engram.maps.map_files import check_file

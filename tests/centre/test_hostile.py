@@ -9,14 +9,14 @@ import sys
 import msgspec
 import pytest
 
-from engram.centre import jobs
-from engram.centre.handins import HandIns
-from engram.centre.merging import admit
-from engram.centre.service import CentreSettings
 from engram.errors import EngramError, MapCorruptError, MapLockedError
+from engram.fleet.centre import jobs
+from engram.fleet.centre.handins import HandIns
+from engram.fleet.centre.merging import admit
+from engram.fleet.centre.service import CentreSettings
+from engram.fleet.transfers import Manifest, bundle, part_hash, split
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
-from engram.transfers import Manifest, bundle, part_hash, split
 
 from .conftest import NAME, Site, drive
 
@@ -191,7 +191,7 @@ def test_admission_ends_at_its_limits(tmp_path, robot):
 def test_admission_runs_under_a_lower_limit_of_the_system():
     """With ``ulimit -f`` below its own it failed every hand-in, in words of time and memory."""
     code = (
-        "import resource as r; from engram.centre.merging import confine; "
+        "import resource as r; from engram.fleet.centre.merging import confine; "
         "r.setrlimit(r.RLIMIT_FSIZE, (2**20, 2**20)); confine(2**33, 60, 2**26); "
         "print(r.getrlimit(r.RLIMIT_FSIZE), r.getrlimit(r.RLIMIT_CPU))"
     )
@@ -200,8 +200,8 @@ def test_admission_runs_under_a_lower_limit_of_the_system():
 
 
 def test_what_the_gate_refuses_stays_and_a_person_may_merge_it(site, robot, monkeypatch):
-    from engram.centre import merging
     from engram.errors import RefusedError
+    from engram.fleet.centre import merging
 
     real = merging.merge
 

@@ -10,9 +10,9 @@ from contextlib import closing
 
 import pytest
 
-from engram.centre import merging
-from engram.centre.handins import HandIns
-from engram.centre.worker import work, work_off
+from engram.fleet.centre import merging
+from engram.fleet.centre.handins import HandIns
+from engram.fleet.centre.worker import work, work_off
 from engram.maps.map import Map
 from engram.maps.rows import sealed
 from engram.maps.schema import sessions
@@ -108,7 +108,7 @@ def test_a_worker_goes_on_after_a_fault_that_nobody_foresaw(site, monkeypatch, w
         raise AssertionError(where)
 
     handed(site, "r1")
-    monkeypatch.setattr("engram.centre.worker.work_off", raising)
+    monkeypatch.setattr("engram.fleet.centre.worker.work_off", raising)
     work(site.centre, waits.append, lambda: len(waits) == 2)
     assert waits == [10.0, 10.0]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from engram.centre.errors import StoreError
-from engram.centre.objects import BucketObjects, FolderObjects
 from engram.errors import MapError
+from engram.fleet.centre.errors import StoreError
+from engram.fleet.centre.objects import BucketObjects, FolderObjects
 
 
 @pytest.fixture(params=["folder", "bucket", "s3"])

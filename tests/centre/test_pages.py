@@ -6,9 +6,9 @@ import re
 
 import pytest
 
-from engram.agent.link import enrol
-from engram.centre import merging
-from engram.centre.access import Role, add_person, new_code
+from engram.fleet.agent.link import enrol
+from engram.fleet.centre import merging
+from engram.fleet.centre.access import Role, add_person, new_code
 
 from .conftest import KINDS, NAME, admit_here, drive, opened_site
 

@@ -8,9 +8,9 @@ from dataclasses import fields
 import pytest
 from sqlalchemy import update
 
-from engram.centre.database import maps
-from engram.centre.service import Centre, MapPolicy
 from engram.cli.settings import AllSettings
+from engram.fleet.centre.database import maps
+from engram.fleet.centre.service import Centre, MapPolicy
 from engram.fleet.merge.settings import MergeOptions
 
 # The ranking stood under `policy`, and none was null.

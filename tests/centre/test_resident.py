@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from engram.centre.errors import UnknownError
-from engram.centre.service import log_of
 from engram.errors import EngramError
+from engram.fleet.centre.errors import UnknownError
+from engram.fleet.centre.service import log_of
 
 from .conftest import NAME, drive
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from engram.centre.objects import Packs
-from engram.centre.service import DAY_NS
-from engram.centre.worker import sweep
-from engram.transfers import part_hash
+from engram.fleet.centre.objects import Packs
+from engram.fleet.centre.service import DAY_NS
+from engram.fleet.centre.worker import sweep
+from engram.fleet.transfers import part_hash
 
 from .conftest import NAME, drive
 

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from engram.centre.database import Waker, ring
+from engram.fleet.centre.database import Waker, ring
 
 from .conftest import drive
 

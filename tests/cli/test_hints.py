@@ -85,7 +85,7 @@ def _place(path: Path) -> str:
     return path.relative_to(SOURCE).as_posix()
 
 
-TEXTS = [one for one in texts() if not one[0].startswith("centre/pages")]
+TEXTS = [one for one in texts() if not one[0].startswith("fleet/centre/pages")]
 
 
 def command(words: tuple[str, ...]) -> Any:

@@ -18,9 +18,9 @@ from sqlalchemy import Engine, event
 from tests.mapping_rig import map_simulated
 from tests.synthetic_world import World, drive
 
-from engram.centre import merging
 from engram.errors import ConfigError, InputError
 from engram.fleet.build.orders import JudgeOptions
+from engram.fleet.centre import merging
 from engram.fleet.dream import (
     BEHAVIOURS,
     DreamOptions,

@@ -7,9 +7,7 @@ import pytest
 from tests.fleet.robots import robot_map
 
 from engram.errors import InputError, MapCorruptError
-from engram.maps.map import Map
-from engram.maps.map_files import check_file
-from engram.transfers import (
+from engram.fleet.transfers import (
     MissingPartError,
     Unbundler,
     bundle,
@@ -18,6 +16,8 @@ from engram.transfers import (
     join,
     split,
 )
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from tests.centre.conftest import drive
 
-from engram.agent.agent import MAP
-from engram.agent.link import enrol
-from engram.centre.access import new_code
-from engram.centre.service import Centre, MapPolicy
 from engram.errors import EngramError
+from engram.fleet.agent.agent import MAP
+from engram.fleet.agent.link import enrol
+from engram.fleet.centre.access import new_code
+from engram.fleet.centre.service import Centre, MapPolicy
 from engram.fleet.merge.settings import MergeOptions
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
@@ -69,7 +69,7 @@ def test_a_download_that_cannot_be_made_ends_at_once_with_its_reason(
     def refuse(*_: object, **__: object) -> None:
         raise EngramError("no such hour")
 
-    monkeypatch.setattr("engram.centre.jobs.download", refuse)
+    monkeypatch.setattr("engram.fleet.centre.jobs.download", refuse)
     robot = town.robot("r1", 1_000)
     robot.hand_in("first")
     with pytest.raises(EngramError, match=r"r1 downloads, copy: .*no such hour"):
@@ -82,7 +82,7 @@ def test_a_hand_in_that_cannot_be_merged_ends_at_once_with_its_reason(
     def refuse(*_: object) -> None:
         raise EngramError("no such thing")
 
-    monkeypatch.setattr("engram.centre.merging.admit", refuse)
+    monkeypatch.setattr("engram.fleet.centre.merging.admit", refuse)
     with pytest.raises(EngramError, match=r"the centre merges r1's first foray: no such thing"):
         town.robot("r1", 1_000).hand_in("first")
 

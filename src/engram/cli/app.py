@@ -13,11 +13,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from engram import PRE_RELEASE, __version__
-from engram.cli.agent import agent_group
-from engram.cli.centre import centre_group
 from engram.cli.drive import drive_group, live
 from engram.cli.drives import doctor, localise, map_, record
-from engram.cli.fleet import build, download, dream, merge
 from engram.cli.frame import anchor, export, goal
 from engram.cli.history import diff, log, revert, show, tag
 from engram.cli.maps import amend, check, info, plot, view, vocabulary
@@ -26,6 +23,7 @@ from engram.cli.screen import UnwritableError, forget, screen
 from engram.cli.showing import features, settings
 from engram.cli.trying import try_
 from engram.errors import ConfigError, EngramError, IncompatibleError, InputError, UnfitDriveError
+from engram.fleet.cli.joined import FLEET_GROUPS, FLEET_VERBS
 from engram.plugins import PluginGroup
 
 GROUPS: dict[str, dict[str, Callable[..., None]]] = {
@@ -49,7 +47,7 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
         "export": export,
     },
     "History": {"log": log, "show": show, "diff": diff, "tag": tag, "revert": revert},
-    "Fleet": {"merge": merge, "download": download, "build": build, "dream": dream},
+    "Fleet": FLEET_VERBS,
     "Settings": {"settings": settings, "features": features},
 }
 VERBS = {name: verb for group in GROUPS.values() for name, verb in group.items()}
@@ -57,7 +55,7 @@ VERBS = {name: verb for group in GROUPS.values() for name, verb in group.items()
 # Verbs with verbs of their own.
 NESTED: dict[str, dict[str, typer.Typer]] = {
     "Drives": {"drive": drive_group},
-    "Service": {"centre": centre_group, "agent": agent_group},
+    "Service": FLEET_GROUPS,
 }
 
 # What the laboratory brings, a distribution of its own.

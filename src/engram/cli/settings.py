@@ -10,21 +10,17 @@ import typing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from msgspec import Meta
 
 from engram.config import check_bounds, from_dict, read_toml, to_dict
 from engram.errors import ConfigError
-from engram.fleet.merge.settings import MergeSettings
+from engram.fleet.settings import BuildSettings, DownloadSettings, MergeSettings
 from engram.frontend.frame import DescriptorKind
-from engram.measures import Estimator
 from engram.repair.finding import RepairConfig
 from engram.robot.anchors import IslandsConfig
 from engram.robot.settings import Settings, settings_text
-
-if TYPE_CHECKING:
-    from engram.fleet.download.mission import DownloadOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,67 +49,8 @@ class DriveSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class BuildSettings:
-    """How `build` judges orders of merging."""
-
-    max_gap_m: Annotated[
-        float,
-        Meta(ge=0, description="m; the best order has the fewest longer gaps. Source: [G16] §VI"),
-    ] = 10.0
-    estimator: Annotated[
-        Estimator,
-        Meta(description="what failures are counted over: route, gap, lost, reacquired ([G16])"),
-    ] = Estimator.ROUTE
-
-    def __post_init__(self) -> None:
-        check_bounds(self)
-
-
-@dataclass(frozen=True, slots=True)
-class DownloadSettings:
-    """Settings of the selections of `download`."""
-
-    window_min: Annotated[
-        float, Meta(ge=0, le=720, description="tod: minutes around departure. Source: [G16] §VI-D")
-    ] = 180.0
-    epoch_min: Annotated[
-        float, Meta(ge=1, le=1440, description="paths: length of an epoch, minutes")
-    ] = 60.0
-    best_percent: Annotated[
-        float, Meta(ge=0, le=100, description="paths: share of each epoch's paths. [G16] §VI-D")
-    ] = 50.0
-    buffer_min: Annotated[
-        float, Meta(ge=0, le=720, description="paths: minutes added before and after the mission")
-    ] = 0.0
-    widen_min: Annotated[
-        float,
-        Meta(gt=0, le=720, description="step by which an hour without data is widened, minutes"),
-    ] = 60.0
-    latitude_deg: (
-        Annotated[
-            float,
-            Meta(ge=-90, le=90, description="degrees north, for the sun; none: estimated"),
-        ]
-        | None
-    ) = None
-    radius_m: Annotated[
-        float, Meta(ge=0, description="m along the edges around --near and --route")
-    ] = 20.0
-
-    def __post_init__(self) -> None:
-        check_bounds(self)
-
-    def options(self, select: str, **mission: Any) -> DownloadOptions:
-        """What to download by these settings; see `DownloadOptions` for what a mission is."""
-        from engram.fleet.download.mission import DownloadOptions
-
-        own = {one.name: getattr(self, one.name) for one in dataclasses.fields(self)}
-        return DownloadOptions(select, **{**own, **mission})
-
-
-@dataclass(frozen=True, slots=True)
 class AllSettings(Settings):
-    """What a settings file may contain: the robot's settings, then those of the fleet's verbs."""
+    """What a settings file may contain: the robot's settings, then those of verbs."""
 
     drive: DriveSettings = field(default_factory=DriveSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)

@@ -28,16 +28,16 @@ from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from engram.agent.agent import Agent
-from engram.agent.link import enrol
-from engram.agent.outbox import QUEUED, SENT
-from engram.agent.state import AgentSettings
-from engram.centre.access import new_code
-from engram.centre.database import first_broken
-from engram.centre.handins import HandIns
-from engram.centre.service import Centre
-from engram.centre.serving import Listening, run_worker, serve
 from engram.errors import EngramError
+from engram.fleet.agent.agent import Agent
+from engram.fleet.agent.link import enrol
+from engram.fleet.agent.outbox import QUEUED, SENT
+from engram.fleet.agent.state import AgentSettings
+from engram.fleet.centre.access import new_code
+from engram.fleet.centre.database import first_broken
+from engram.fleet.centre.handins import HandIns
+from engram.fleet.centre.service import Centre
+from engram.fleet.centre.serving import Listening, run_worker, serve
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.settings import MergeOptions
 from engram.maps.map import Map
@@ -52,7 +52,7 @@ _NODES = 4
 _LOADED = [
     __name__,
     "uvicorn.protocols.http.auto",
-    "engram.centre.app",
+    "engram.fleet.centre.app",
     "engram.fleet.download",
 ]
 _LOOK_S = 0.05

@@ -30,10 +30,10 @@ from typing import Any
 import httpx
 import numpy as np
 
-from engram.agent.agent import Agent
-from engram.agent.link import enrol, new_client
-from engram.centre.access import new_code
-from engram.centre.service import Centre, MapPolicy
+from engram.fleet.agent.agent import Agent
+from engram.fleet.agent.link import enrol, new_client
+from engram.fleet.centre.access import new_code
+from engram.fleet.centre.service import Centre, MapPolicy
 from engram.fleet.merge.settings import MergeOptions
 from engram.maps.map import open_map
 from engram_lab.checks.merge_scaling import SESSION_NODES, write_map, write_session

@@ -16,11 +16,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from engram.agent.agent import Agent
-from engram.agent.link import enrol, new_client
-from engram.agent.outbox import QUEUED
-from engram.agent.state import AgentSettings
-from engram.centre.access import new_code
+from engram.fleet.agent.agent import Agent
+from engram.fleet.agent.link import enrol, new_client
+from engram.fleet.agent.outbox import QUEUED
+from engram.fleet.agent.state import AgentSettings
+from engram.fleet.centre.access import new_code
 from engram.graph.model import Attempt, PathEntry, PathEntryKind, path_id
 from engram.graph.paths import Attempts
 from engram.maps.map import Map, open_map

@@ -252,9 +252,9 @@ def fleet_day(
     else:
         _show_day(report)
     if serve:
-        from engram.centre.service import Centre
-        from engram.centre.serving import Listening
-        from engram.centre.serving import serve as run
+        from engram.fleet.centre.service import Centre
+        from engram.fleet.centre.serving import Listening
+        from engram.fleet.centre.serving import serve as run
 
         listening = Listening("127.0.0.1", 8440)
         typer.echo(f"http://127.0.0.1:8440 with the token {report.token}; Ctrl-C ends it")

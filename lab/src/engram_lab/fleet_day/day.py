@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from engram.agent.link import enrol
-from engram.centre.access import Role, add_person, new_code
-from engram.centre.service import Centre
 from engram.config import plain
+from engram.fleet.agent.link import enrol
+from engram.fleet.centre.access import Role, add_person, new_code
+from engram.fleet.centre.service import Centre
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.monitor import QUIET, Monitor, Relay
@@ -231,7 +231,7 @@ def listening(centre: Centre) -> Iterator[int]:
     """Serves a centre on a free port of this machine, without a worker."""
     import uvicorn
 
-    from engram.centre.app import create_app
+    from engram.fleet.centre.app import create_app
 
     config = uvicorn.Config(
         create_app(centre), log_level="error", timeout_graceful_shutdown=_FAREWELL_S

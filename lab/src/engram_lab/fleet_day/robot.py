@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from engram.agent.agent import MAP, Agent
-from engram.agent.link import Unreachable
-from engram.agent.outbox import QUEUED, SENT
-from engram.agent.state import AgentSettings
-from engram.centre.merging import merge_hand_in
-from engram.centre.service import Centre
-from engram.centre.worker import work_off
 from engram.errors import EngramError
+from engram.fleet.agent.agent import MAP, Agent
+from engram.fleet.agent.link import Unreachable
+from engram.fleet.agent.outbox import QUEUED, SENT
+from engram.fleet.agent.state import AgentSettings
+from engram.fleet.centre.merging import merge_hand_in
+from engram.fleet.centre.service import Centre
+from engram.fleet.centre.worker import work_off
 from engram.geometry.se3 import SE3
 from engram.localiser.localisation import Position
 from engram.maps.map import Map

@@ -15,6 +15,7 @@ import cv2
 import msgspec
 import numpy as np
 
+from engram.fleet.transfers import Manifest, PartHash, split
 from engram.frontend.blobs import decode_landmarks
 from engram.frontend.frame import Frame, FrameStatus
 from engram.geometry.se3 import SE3
@@ -45,7 +46,6 @@ from engram.places.vocabulary import encode_vocabulary, one_word_vocabulary
 from engram.sequences.framelog.file import FrameLogHeader
 from engram.sequences.framelog.writer import FlightWriter, FrameLogWriter
 from engram.sequences.sequence import LoggedFrame, SequenceInfo
-from engram.transfers import Manifest, PartHash, split
 from engram_lab.synthetic_places import (
     CAMERA,
     DESCRIPTOR,

@@ -11,19 +11,26 @@ from typing import Any
 import msgspec
 from fastapi.testclient import TestClient
 
-from engram.agent.agent import Agent
-from engram.agent.link import enrol
-from engram.centre.access import new_code
-from engram.centre.app import create_app
-from engram.centre.handins import HandIns
-from engram.centre.merging import merge_hand_in
-from engram.centre.service import Centre, CentreSettings, MapPolicy
-from engram.centre.worker import work_off
+from engram.fleet.agent.agent import Agent
+from engram.fleet.agent.link import enrol
+from engram.fleet.centre.access import new_code
+from engram.fleet.centre.app import create_app
+from engram.fleet.centre.handins import HandIns
+from engram.fleet.centre.merging import merge_hand_in
+from engram.fleet.centre.service import Centre, CentreSettings, MapPolicy
+from engram.fleet.centre.worker import work_off
 from engram.fleet.merge.settings import MergeOptions
+from engram.fleet.transfers import (
+    MAX_PART_BYTES,
+    Manifest,
+    PartHash,
+    bundle,
+    encode_manifest,
+    part_hash,
+)
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.maps.rows import checksum
-from engram.transfers import MAX_PART_BYTES, Manifest, PartHash, bundle, encode_manifest, part_hash
 from engram_lab.mutations import case
 from engram_lab.mutations.case import Case, Samples, Subject
 from engram_lab.mutations.rowwise import changed_value

@@ -13,12 +13,13 @@ from typing import Any
 
 from engram.calibration.formats import read_calibration
 from engram.calibration.toml import CalibrationFile, calibration_toml
-from engram.centre.merging import write_checked
 from engram.cli.settings import read_settings
 from engram.config import load_toml
 from engram.errors import EngramError
+from engram.fleet.centre.merging import write_checked
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.settings import MergeOptions
+from engram.fleet.transfers import Manifest, decode_manifest, split
 from engram.graph.clock import check_zone, hour_of_day, zone_note
 from engram.graph.model import Clock
 from engram.maps.map import Map
@@ -28,7 +29,6 @@ from engram.sequences.framelog.file import FLIGHT_SUFFIX
 from engram.sequences.framelog.reader import FrameLog
 from engram.sequences.framelog.writer import read_decisions, read_images, read_report
 from engram.sequences.sequence import SequenceInfo
-from engram.transfers import Manifest, decode_manifest, split
 from engram_lab.mutations.case import Case, Subject
 
 Held = dict[str, list[tuple[Any, ...]]]

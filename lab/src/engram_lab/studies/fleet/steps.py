@@ -21,12 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from engram.cli.settings import DownloadSettings
 from engram.errors import InputError
 from engram.fleet.build.building import find_best_order
 from engram.fleet.build.orders import JudgeOptions
 from engram.fleet.download.downloading import DownloadReport, download
 from engram.fleet.merge.merging import merge as merge_maps
+from engram.fleet.settings import DownloadSettings
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, SessionId, node_id, path_id
 from engram.localiser.acceptance import accept_lost

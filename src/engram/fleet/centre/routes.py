@@ -11,15 +11,15 @@ from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
-from engram.centre import models
-from engram.centre.access import Role, disable, enrol, new_code, new_nonce, new_token
-from engram.centre.database import events_after, note
-from engram.centre.errors import ChangedError
-from engram.centre.fleet import Fleet, Refs
-from engram.centre.requests import Asking, CentreHere, page_of, takes
-from engram.centre.service import Centre
 from engram.config import plain
 from engram.errors import InputError
+from engram.fleet.centre import models
+from engram.fleet.centre.access import Role, disable, enrol, new_code, new_nonce, new_token
+from engram.fleet.centre.database import events_after, note
+from engram.fleet.centre.errors import ChangedError
+from engram.fleet.centre.fleet import Fleet, Refs
+from engram.fleet.centre.requests import Asking, CentreHere, page_of, takes
+from engram.fleet.centre.service import Centre
 from engram.maps.history import blame_node, map_log
 from engram.maps.map import Map
 

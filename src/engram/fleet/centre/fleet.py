@@ -8,10 +8,10 @@ from typing import Any
 
 from sqlalchemy import delete, func, select, update
 
-from engram.centre.database import first_row, handins, note, refs, robots, rows_of, subjects
-from engram.centre.errors import ChangedError, UnknownError
-from engram.centre.service import Centre
 from engram.errors import InputError, RevisionError
+from engram.fleet.centre.database import first_row, handins, note, refs, robots, rows_of, subjects
+from engram.fleet.centre.errors import ChangedError, UnknownError
+from engram.fleet.centre.service import Centre
 from engram.maps.map import Map
 
 HEAD = "head"

@@ -125,7 +125,7 @@ class WirePages(Body):
 
 
 class ManifestBody(Body):
-    """What a map consists of; see `engram.transfers`."""
+    """What a map consists of; see `engram.fleet.transfers`."""
 
     format: Annotated[str, Field(max_length=40, examples=["engram-parts-1"])]
     content_hash: Annotated[str, Field(pattern=r"^[0-9a-f]{32}$", examples=[_ID])]

@@ -13,13 +13,13 @@ from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from engram import __version__
-from engram.centre import transfer_routes
-from engram.centre.database import artifacts, dreams, handins
-from engram.centre.models import Health
-from engram.centre.pages import routes as pages
-from engram.centre.requests import DESCRIBED, CentreHere, add_problems
-from engram.centre.routes import maps_router, robots_router
-from engram.centre.service import Centre
+from engram.fleet.centre import transfer_routes
+from engram.fleet.centre.database import artifacts, dreams, handins
+from engram.fleet.centre.models import Health
+from engram.fleet.centre.pages import routes as pages
+from engram.fleet.centre.requests import DESCRIBED, CentreHere, add_problems
+from engram.fleet.centre.routes import maps_router, robots_router
+from engram.fleet.centre.service import Centre
 
 _ABOUT = """The fleet's shared map as a service: robots hand in what they saw, and download what the
 next mission needs. Errors are problem details (RFC 9457). Whatever is sent twice is done once."""

@@ -17,7 +17,10 @@ from typing import Annotated, Any
 from msgspec import Meta
 from sqlalchemy import URL, Connection, Select, func, select, update
 
-from engram.centre.database import (
+from engram.config import check_bounds, from_dict, to_dict
+from engram.errors import InputError, MapLockedError
+from engram.files import WriterLock
+from engram.fleet.centre.database import (
     ServiceDatabase,
     artifacts,
     first_row,
@@ -27,11 +30,8 @@ from engram.centre.database import (
     refs,
     rows_of,
 )
-from engram.centre.errors import UnknownError
-from engram.centre.objects import BucketObjects, FolderObjects, Objects, Packs
-from engram.config import check_bounds, from_dict, to_dict
-from engram.errors import InputError, MapLockedError
-from engram.files import WriterLock
+from engram.fleet.centre.errors import UnknownError
+from engram.fleet.centre.objects import BucketObjects, FolderObjects, Objects, Packs
 from engram.fleet.merge.settings import NO_RELOCALISER, MergeOptions
 from engram.maps.map import Map
 from engram.maps.map_reader import MapReader

@@ -14,7 +14,8 @@ from enum import StrEnum
 
 from sqlalchemy import Connection, delete, select, update
 
-from engram.centre.database import (
+from engram.errors import InputError
+from engram.fleet.centre.database import (
     codes,
     first_row,
     grants,
@@ -25,11 +26,10 @@ from engram.centre.database import (
     subjects,
     tokens,
 )
-from engram.centre.errors import NotAllowedError, NotKnownError, UnknownError
-from engram.centre.fleet import check_followed
-from engram.centre.service import DAY_NS, Centre
-from engram.errors import InputError
-from engram.transfers import check_signature, enrolment_text, token_text
+from engram.fleet.centre.errors import NotAllowedError, NotKnownError, UnknownError
+from engram.fleet.centre.fleet import check_followed
+from engram.fleet.centre.service import DAY_NS, Centre
+from engram.fleet.transfers import check_signature, enrolment_text, token_text
 
 ALL_MAPS = "*"
 

@@ -13,11 +13,11 @@ from typing import Any, Protocol
 
 from sqlalchemy import Connection, Select, delete, select
 
-from engram.centre.database import ServiceDatabase, given, packs, parts, rows_of
-from engram.centre.errors import StoreError
 from engram.errors import MapError, MissingExtraError, storage_full
+from engram.fleet.centre.database import ServiceDatabase, given, packs, parts, rows_of
+from engram.fleet.centre.errors import StoreError
+from engram.fleet.transfers import PartHash
 from engram.monitor import write_whole
-from engram.transfers import PartHash
 
 
 class Objects(Protocol):

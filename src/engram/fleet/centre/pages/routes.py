@@ -14,15 +14,15 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
-from engram.centre.access import Role, Subject, names_of, subject_of
-from engram.centre.database import first_broken, newest_events
-from engram.centre.errors import CentreError, UnknownError
-from engram.centre.fleet import Fleet, Refs
-from engram.centre.handins import HandIns
-from engram.centre.jobs import Downloads, Dreams
-from engram.centre.pages.positions import drawn, thumbnail
-from engram.centre.requests import COOKIE, Asking, CentreHere, takes, who_asks
-from engram.centre.service import Centre
+from engram.fleet.centre.access import Role, Subject, names_of, subject_of
+from engram.fleet.centre.database import first_broken, newest_events
+from engram.fleet.centre.errors import CentreError, UnknownError
+from engram.fleet.centre.fleet import Fleet, Refs
+from engram.fleet.centre.handins import HandIns
+from engram.fleet.centre.jobs import Downloads, Dreams
+from engram.fleet.centre.pages.positions import drawn, thumbnail
+from engram.fleet.centre.requests import COOKIE, Asking, CentreHere, takes, who_asks
+from engram.fleet.centre.service import Centre
 from engram.maps.history import map_log
 from engram.untrusted import printable
 
@@ -38,7 +38,7 @@ _POLICY = (
 )
 # Names of robots and tags are anybody's: no control characters, no markup.
 _templates = Environment(
-    loader=PackageLoader("engram.centre.pages"),
+    loader=PackageLoader("engram.fleet.centre.pages"),
     autoescape=True,
     finalize=lambda value: printable(value) if type(value) is str else value,
 )

@@ -8,12 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from engram.agent.link import CentreRefusedError, Link
-from engram.agent.state import AgentState
 from engram.counts import counted
 from engram.errors import MapCorruptError, StorageFullError
-from engram.maps.map_files import check_file
-from engram.transfers import (
+from engram.fleet.agent.link import CentreRefusedError, Link
+from engram.fleet.agent.state import AgentState
+from engram.fleet.transfers import (
     Manifest,
     PartHash,
     Split,
@@ -23,6 +22,7 @@ from engram.transfers import (
     join,
     split,
 )
+from engram.maps.map_files import check_file
 
 QUEUED, SENT, SETTLED, FAILED = "queued", "sent", "settled", "failed"
 _ENDED_BADLY = {"failed", "cancelled"}
@@ -318,6 +318,6 @@ def _manifest(sent: Any) -> Manifest:
 
 
 def _text(manifest: Manifest) -> str:
-    from engram.transfers import encode_manifest
+    from engram.fleet.transfers import encode_manifest
 
     return encode_manifest(manifest).decode()

@@ -21,9 +21,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from engram.agent.link import PARTS, Link, enrolled, new_client, signer_of
-from engram.agent.outbox import FAILED, QUEUED, SENT, Fetch, Outbox
-from engram.agent.state import AgentSettings
 from engram.errors import (
     EngramError,
     InputError,
@@ -33,6 +30,9 @@ from engram.errors import (
     storage_full,
 )
 from engram.files import WriterLock
+from engram.fleet.agent.link import PARTS, Link, enrolled, new_client, signer_of
+from engram.fleet.agent.outbox import FAILED, QUEUED, SENT, Fetch, Outbox
+from engram.fleet.agent.state import AgentSettings
 from engram.maps.map import Map
 from engram.maps.map_files import check_file, copy_map
 

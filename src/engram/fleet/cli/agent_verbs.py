@@ -14,7 +14,7 @@ from engram.cli import options
 from engram.cli.options import PartlyDoneError
 
 if TYPE_CHECKING:
-    from engram.agent.agent import Agent
+    from engram.fleet.agent.agent import Agent
 
 agent_group = typer.Typer(
     help="The robot's side of the centre.",
@@ -32,10 +32,10 @@ _LOOK_S = 0.5
 
 
 def _open(folder: Path, config: Path | None = None) -> Agent:
-    from engram.agent.agent import Agent
-    from engram.agent.state import AgentSettings
     from engram.config import load_toml
     from engram.errors import ConfigError
+    from engram.fleet.agent.agent import Agent
+    from engram.fleet.agent.state import AgentSettings
     from engram.untrusted import read_text
 
     text = "" if config is None else read_text(config, ConfigError)
@@ -59,7 +59,7 @@ def enrol(
     Examples:
       engram agent enrol r1 https://town.example:8440 CODE --robot r1
     """
-    from engram.agent.link import enrol as enrol_robot
+    from engram.fleet.agent.link import enrol as enrol_robot
 
     typer.echo(f"{robot} is a robot of {enrol_robot(folder, url, code, robot)}")
 

@@ -15,7 +15,7 @@ from engram.cli.options import output_folder
 from engram.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
-    from engram.centre.service import Centre
+    from engram.fleet.centre.service import Centre
 
 
 Folder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="The centre's folder.")]
@@ -42,7 +42,7 @@ def open_centre(folder: Path, database: str | None = None, objects: str | None =
     Raises:
         InputError: it is not there; `serve` and `map` make one, a mistyped name does not.
     """
-    from engram.centre.service import Centre
+    from engram.fleet.centre.service import Centre
 
     if not (folder / ("maps" if database else "centre.sqlite")).exists():
         raise InputError(f"{folder}: there is no centre; start one: engram centre serve {folder}")
@@ -89,8 +89,8 @@ def map_(
       engram centre map town campus --gate held-out.framelog --moves stable
       engram centre map town fleet --set merge.rounds=8
     """
-    from engram.centre.service import Centre
-    from engram.cli.fleet import merging_of
+    from engram.fleet.centre.service import Centre
+    from engram.fleet.cli.verbs import merging_of
 
     changes: dict[str, Any] = {}
     if settings.config is not None or settings.changes:
@@ -123,7 +123,7 @@ def _gate(drives: list[Path]) -> tuple[str, ...]:
 
 
 def _movable(ref: str) -> str | None:
-    from engram.centre.fleet import check_movable
+    from engram.fleet.centre.fleet import check_movable
 
     if ref == NONE:
         return None
@@ -164,7 +164,7 @@ def dream(
     Examples:
       engram centre dream town
     """
-    from engram.centre.jobs import Dreams
+    from engram.fleet.centre.jobs import Dreams
 
     with open_centre(folder, database) as centre:
         dreams = Dreams(centre)
@@ -190,8 +190,8 @@ def jobs(
       engram centre jobs town
       engram centre jobs town --map campus --json
     """
-    from engram.centre.handins import HandIns
-    from engram.centre.jobs import Dreams
+    from engram.fleet.centre.handins import HandIns
+    from engram.fleet.centre.jobs import Dreams
 
     with open_centre(folder, database) as centre:
         centre.map_row(map_name)
@@ -251,8 +251,8 @@ def serve(
       engram centre serve town
       engram centre serve town --host 0.0.0.0 --tls-certificate town.pem --tls-key town.key
     """
-    from engram.centre import serving
-    from engram.centre.service import Centre
+    from engram.fleet.centre import serving
+    from engram.fleet.centre.service import Centre
     from engram.logs import logging_to_stderr
 
     listening = serving.Listening(host, port, certificate, key, insecure=insecure)
@@ -279,7 +279,7 @@ def worker(
     Examples:
       engram centre worker town
     """
-    from engram.centre.serving import run_worker
+    from engram.fleet.centre.serving import run_worker
 
     open_centre(folder, database, objects).close()
     run_worker(folder, database, objects, scheduler)
@@ -304,7 +304,7 @@ def code(
       engram centre code town
       engram centre code town --follows stable
     """
-    from engram.centre.access import new_code
+    from engram.fleet.centre.access import new_code
 
     with open_centre(folder, database) as centre:
         print(new_code(centre, map_name, follows, BY))
@@ -331,7 +331,7 @@ def token(
       engram centre token town --name alice --role operator
       engram centre token town --name alice --role none
     """
-    from engram.centre.access import Role, add_person, take_away
+    from engram.fleet.centre.access import Role, add_person, take_away
 
     roles = [str(one) for one in Role if one is not Role.ROBOT]
     if role not in {*roles, NONE}:
@@ -353,7 +353,7 @@ def sweep(folder: Folder, *, database: Database = None, objects: Objects = None)
     Examples:
       engram centre sweep town
     """
-    from engram.centre.worker import sweep as run
+    from engram.fleet.centre.worker import sweep as run
 
     with open_centre(folder, database, objects) as centre:
         for name in centre.map_names():
@@ -378,7 +378,7 @@ def backup(
     Examples:
       engram centre backup town town-backup
     """
-    from engram.centre.serving import back_up
+    from engram.fleet.centre.serving import back_up
 
     with open_centre(folder, database, objects) as centre:
         for name, revision in back_up(centre, target).items():

@@ -26,14 +26,15 @@ from typing import Any, TypeAlias
 
 from sqlalchemy import select
 
-from engram.centre.database import artifacts, note, packs
-from engram.centre.errors import StoreError
-from engram.centre.fleet import Refs
-from engram.centre.handins import HandIns
-from engram.centre.jobs import Downloads, Dreams
-from engram.centre.merging import WaitsError, Watching, admit, merge_apart
-from engram.centre.objects import written_ns
-from engram.centre.service import (
+from engram.errors import EngramError, MapCorruptError, MapLockedError, StorageFullError
+from engram.fleet.centre.database import artifacts, note, packs
+from engram.fleet.centre.errors import StoreError
+from engram.fleet.centre.fleet import Refs
+from engram.fleet.centre.handins import HandIns
+from engram.fleet.centre.jobs import Downloads, Dreams
+from engram.fleet.centre.merging import WaitsError, Watching, admit, merge_apart
+from engram.fleet.centre.objects import written_ns
+from engram.fleet.centre.service import (
     ASKED,
     CANCELLED,
     DAY_NS,
@@ -44,12 +45,11 @@ from engram.centre.service import (
     manifest_key,
     needed_manifests,
 )
-from engram.errors import EngramError, MapCorruptError, MapLockedError, StorageFullError
 from engram.fleet.dream import DreamOptions, dream
+from engram.fleet.transfers import PartHash, blobs_named, decode_manifest
 from engram.maps.map import Map
 from engram.processes import end_with_parent
 from engram.robot.settings import Settings
-from engram.transfers import PartHash, blobs_named, decode_manifest
 
 # Parts of manifests, by the manifest's hash.
 _Marks: TypeAlias = dict[str, set[PartHash]]

@@ -13,7 +13,9 @@ from typing import Any
 
 from sqlalchemy import Connection, func, or_, select, update
 
-from engram.centre.database import (
+from engram.counts import counted
+from engram.errors import InputError, MapCorruptError
+from engram.fleet.centre.database import (
     artifact_grants,
     artifacts,
     first_row,
@@ -23,15 +25,15 @@ from engram.centre.database import (
     rows_of,
     usage,
 )
-from engram.centre.errors import (
+from engram.fleet.centre.errors import (
     ConflictError,
     MalformedError,
     MissingPartsError,
     QuotaError,
     UnknownError,
 )
-from engram.centre.objects import given_by
-from engram.centre.service import (
+from engram.fleet.centre.objects import given_by
+from engram.fleet.centre.service import (
     DAY_NS,
     ENDED,
     Centre,
@@ -40,10 +42,7 @@ from engram.centre.service import (
     manifest_key,
     needed_manifests,
 )
-from engram.counts import counted
-from engram.errors import InputError, MapCorruptError
-from engram.maps.schema import frames, nodes, vocabularies
-from engram.transfers import (
+from engram.fleet.transfers import (
     Manifest,
     PartHash,
     WireManifest,
@@ -51,6 +50,7 @@ from engram.transfers import (
     decode_page,
     encode_manifest,
 )
+from engram.maps.schema import frames, nodes, vocabularies
 
 
 class Parts:

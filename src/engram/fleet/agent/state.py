@@ -15,8 +15,8 @@ from sqlalchemy import MetaData
 
 from engram.config import check_bounds
 from engram.errors import MapError
+from engram.fleet.transfers import PartHash
 from engram.sqlite import FileKind, SqliteFile
-from engram.transfers import PartHash
 
 _FILE = FileKind(
     noun="file of an agent",

@@ -29,10 +29,6 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-from engram.centre.errors import MissingPartsError, StoreError
-from engram.centre.fleet import Refs
-from engram.centre.handins import HandIns, Parts
-from engram.centre.service import Centre, CentreSettings, HandInState, MapPolicy
 from engram.counts import counted
 from engram.errors import (
     EngramError,
@@ -43,15 +39,19 @@ from engram.errors import (
     StorageFullError,
     WorkerError,
 )
+from engram.fleet.centre.errors import MissingPartsError, StoreError
+from engram.fleet.centre.fleet import Refs
+from engram.fleet.centre.handins import HandIns, Parts
+from engram.fleet.centre.service import Centre, CentreSettings, HandInState, MapPolicy
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.report import MergeReport
+from engram.fleet.transfers import Manifest, PartHash, join
 from engram.logs import logging_to_stderr
 from engram.maps.map import Map
 from engram.monitor import Monitor
 from engram.places.words import problems_of
 from engram.processes import end_with_parent
 from engram.robot.settings import Settings
-from engram.transfers import Manifest, PartHash, join
 
 _NEW_USER, _NEW_NETWORK = 0x10000000, 0x40000000
 _SHOWN_PROBLEMS = 5

@@ -11,17 +11,17 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
-from engram.centre import models
-from engram.centre.access import Role, Subject
-from engram.centre.errors import NotAllowedError, QuotaError, UnknownError
-from engram.centre.handins import HandIns, Parts
-from engram.centre.jobs import Downloads, Dreams, options_of
-from engram.centre.objects import PACK_BYTES
-from engram.centre.requests import Asking, CentreHere, page_of, takes
-from engram.centre.routes import Cursor, Limit
-from engram.centre.service import ASKED, Centre
 from engram.errors import InputError
-from engram.transfers import (
+from engram.fleet.centre import models
+from engram.fleet.centre.access import Role, Subject
+from engram.fleet.centre.errors import NotAllowedError, QuotaError, UnknownError
+from engram.fleet.centre.handins import HandIns, Parts
+from engram.fleet.centre.jobs import Downloads, Dreams, options_of
+from engram.fleet.centre.objects import PACK_BYTES
+from engram.fleet.centre.requests import Asking, CentreHere, page_of, takes
+from engram.fleet.centre.routes import Cursor, Limit
+from engram.fleet.centre.service import ASKED, Centre
+from engram.fleet.transfers import (
     MAX_PART_BYTES,
     PartHash,
     Unbundler,

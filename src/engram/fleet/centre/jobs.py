@@ -16,7 +16,10 @@ from typing import Any, TypedDict, get_type_hints
 import msgspec
 from sqlalchemy import delete, select, update
 
-from engram.centre.database import (
+from engram.config import to_dict
+from engram.counts import counted
+from engram.errors import ConfigError, EngramError, StorageFullError
+from engram.fleet.centre.database import (
     artifact_grants,
     artifacts,
     dreams,
@@ -26,11 +29,11 @@ from engram.centre.database import (
     ring,
     rows_of,
 )
-from engram.centre.errors import ConflictError, StoreError, UnknownError
-from engram.centre.fleet import Refs
-from engram.centre.handins import Parts
-from engram.centre.objects import PACK_BYTES, given_by
-from engram.centre.service import (
+from engram.fleet.centre.errors import ConflictError, StoreError, UnknownError
+from engram.fleet.centre.fleet import Refs
+from engram.fleet.centre.handins import Parts
+from engram.fleet.centre.objects import PACK_BYTES, given_by
+from engram.fleet.centre.service import (
     ASKED,
     CANCELLED,
     DAY_NS,
@@ -41,15 +44,10 @@ from engram.centre.service import (
     log_of,
     newest_merged,
 )
-from engram.config import to_dict
-from engram.counts import counted
-from engram.errors import ConfigError, EngramError, StorageFullError
 from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.dream import FEWEST_DRIVES
-from engram.maps.exchange import MapRows
-from engram.maps.schema import frames, nodes
-from engram.transfers import (
+from engram.fleet.transfers import (
     Manifest,
     PartHash,
     blobs_named,
@@ -59,6 +57,8 @@ from engram.transfers import (
     part_hash,
     split,
 )
+from engram.maps.exchange import MapRows
+from engram.maps.schema import frames, nodes
 
 _log = logging.getLogger(__name__)
 _OPTIONS = TypedDict("_OPTIONS", get_type_hints(DownloadOptions), total=False)  # type: ignore[misc]

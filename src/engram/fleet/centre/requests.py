@@ -13,10 +13,6 @@ from fastapi.responses import JSONResponse, RedirectResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from engram.centre.access import Role, Subject, subject_of
-from engram.centre.errors import CentreError, NotKnownError, StoreError
-from engram.centre.models import Problem
-from engram.centre.service import Centre
 from engram.errors import (
     EngramError,
     IncompatibleError,
@@ -25,6 +21,10 @@ from engram.errors import (
     RevisionError,
     StorageFullError,
 )
+from engram.fleet.centre.access import Role, Subject, subject_of
+from engram.fleet.centre.errors import CentreError, NotKnownError, StoreError
+from engram.fleet.centre.models import Problem
+from engram.fleet.centre.service import Centre
 
 COOKIE = "engram_token"
 

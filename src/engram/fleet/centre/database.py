@@ -42,8 +42,8 @@ from sqlalchemy.dialects.sqlite import insert as insert_sqlite
 from sqlalchemy.exc import ArgumentError, DataError, DBAPIError
 
 from engram import PRE_RELEASE, __version__
-from engram.centre.errors import StoreError
 from engram.errors import FormatVersionError, InputError, MissingExtraError, StorageFullError
+from engram.fleet.centre.errors import StoreError
 from engram.sqlite import is_full
 
 VERSION = 2

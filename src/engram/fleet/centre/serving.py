@@ -17,12 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from engram.centre.database import Waker
-from engram.centre.objects import FolderObjects, sync_folder
-from engram.centre.service import Centre
-from engram.centre.worker import work
 from engram.errors import ConfigError, InputError, MapError, MissingExtraError, StorageFullError
 from engram.files import draft_folder
+from engram.fleet.centre.database import Waker
+from engram.fleet.centre.objects import FolderObjects, sync_folder
+from engram.fleet.centre.service import Centre
+from engram.fleet.centre.worker import work
 from engram.logs import logging_to_stderr
 from engram.maps.map import Map
 from engram.maps.map_files import copy_map
@@ -72,7 +72,7 @@ def serve(centre: Centre, listening: Listening, *, worker: bool = True) -> None:
     try:
         import uvicorn
 
-        from engram.centre.app import create_app
+        from engram.fleet.centre.app import create_app
     except ImportError as error:
         raise MissingExtraError(
             "the centre needs its extra: pip install 'engram-localisation[centre]'"

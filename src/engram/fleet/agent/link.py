@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from engram.agent.state import AgentState
 from engram.errors import EngramError, InputError, MissingExtraError, storage_full
+from engram.fleet.agent.state import AgentState
+from engram.fleet.transfers import PartHash, Signer, Unbundler, bundle, enrolment_text, token_text
 from engram.monitor import write_whole
-from engram.transfers import PartHash, Signer, Unbundler, bundle, enrolment_text, token_text
 
 if TYPE_CHECKING:
     import httpx
