@@ -7,7 +7,6 @@ def counted(number: int, thing: str) -> str:
     """A number of things, in the plural unless it is one.
 
     Args:
-        number: how many.
         thing: one of them, a word or several whose last one has a regular plural.
     """
     if number == 1:

@@ -34,13 +34,9 @@ _DRAFT_LOCK = "draft-lock"  # held by the process that writes the draft, for as 
 
 
 def map_path(location: Path | str) -> Path:
-    """The path of a map file.
-
-    Raises:
-        InputError: it is the address of a database; not shown, as it may hold a password. Or it is
-            not UTF-8, which SQLite needs.
-    """
+    """The path of a map file."""
     if isinstance(location, str) and location.startswith("postgresql"):
+        # Not shown, as it may hold a password.
         raise InputError(
             "this is the address of a PostgreSQL database, not a map file; the database of a "
             "centre is given with --database of engram centre"
@@ -53,11 +49,7 @@ def map_path(location: Path | str) -> Path:
 
 
 def check_there(path: Path, error: type[EngramError] = InputError) -> None:
-    """Refuses a path that does not exist.
-
-    Raises:
-        EngramError: of the kind `error`.
-    """
+    """Refuses a path that does not exist."""
     if not path.exists():
         raise error(f"{path}: there is no such file or folder")
 
@@ -67,7 +59,6 @@ class Holder:
     """Who writes to a file.
 
     Attributes:
-        pid, host: the process, for people.
         token: distinguishes one taking of the lock from all others; process ids are reused, in
             containers almost at once.
     """
@@ -91,9 +82,6 @@ class WriterLock:
     An open-file-description lock: unlike flock it can be asked about without taking it, unlike
     POSIX record locks it also excludes a second writer in the same process, and the kernel drops
     it when the process dies. The lock file itself stays; it names the last holder.
-
-    Attributes:
-        holder: who holds it: this process.
 
     Raises:
         MapLockedError: another process holds it; names process and host.
@@ -179,21 +167,13 @@ def _holder(content: bytes) -> Holder | None:
 
 
 def check_parent(path: Path) -> None:
-    """Reject a new file whose folder does not exist (it may be mistyped).
-
-    Raises:
-        InputError: the folder of the file is not there.
-    """
+    """Reject a new file whose folder does not exist (it may be mistyped)."""
     if not path.parent.is_dir():
         raise InputError(f"{path.parent} is not a folder; make it first")
 
 
 def check_output(path: Path) -> None:
-    """Refuse, before the work, a file that could not be written at its end.
-
-    Raises:
-        InputError: its folder is not there or cannot be written to, or it is no file of one's own.
-    """
+    """Refuse, before the work, a file that could not be written at its end."""
     try:
         if path.is_dir():
             raise InputError(f"{path} is a folder; give the name of a file in it")
@@ -208,11 +188,7 @@ def check_output(path: Path) -> None:
 
 
 def check_output_folder(path: Path) -> None:
-    """Refuse, before the work, a folder that could not be made and filled at its end.
-
-    Raises:
-        InputError: something else has its name, or it cannot be written to.
-    """
+    """Refuse, before the work, a folder that could not be made and filled at its end."""
     try:
         there = next(one for one in (path, *path.absolute().parents) if one.exists())
         if not there.is_dir():
@@ -223,22 +199,13 @@ def check_output_folder(path: Path) -> None:
 
 
 def _try_folder(folder: Path) -> None:
-    """Creates an unnamed file in a folder: permissions alone do not show all that forbids it.
-
-    Raises:
-        OSError: it cannot be made.
-    """
+    """Creates an unnamed file in a folder: permissions alone do not show all that forbids it."""
     tempfile.TemporaryFile(dir=folder).close()
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Yields where to write a file that appears under its name when the block ends.
-
-    Raises:
-        InputError: something is there already, or the folder is not.
-        MapError: it cannot be written.
-    """
+    """Yields where to write a file that appears under its name when the block ends."""
     with naming(path), draft_folder(path) as folder:
         draft = folder / path.name
         yield draft
@@ -247,12 +214,7 @@ def new_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Context of making a new file: raises whatever prevents it as our errors.
-
-    Raises:
-        InputError: something is there already, or the folder is not.
-        MapError: it cannot be written.
-    """
+    """Context of making a new file: raises whatever prevents it as our errors."""
     taken = InputError(f"{path} exists already; open it, or choose another name")
     if path.exists():
         raise taken
@@ -271,11 +233,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 def publish(draft: Path, path: Path) -> None:
-    """Give a draft its name, never replacing a file that came meanwhile as a rename would.
-
-    Raises:
-        OSError: the name is taken, or cannot be given.
-    """
+    """Give a draft its name, never replacing a file that came meanwhile as a rename would."""
     try:
         os.link(draft, path)
     except OSError as error:
@@ -293,12 +251,7 @@ def publish(draft: Path, path: Path) -> None:
 
 @contextmanager
 def draft_folder(path: Path) -> Iterator[Path]:
-    """A folder of its own in the file system of a file to be; it goes away with what it holds.
-
-    Raises:
-        InputError: the folder of the file is not there.
-        MapError: it cannot be written to.
-    """
+    """A folder of its own in the file system of a file to be; it goes away with what it holds."""
     check_parent(path)
     try:
         remove_left_drafts(path.parent, escape(path.name))
@@ -316,10 +269,6 @@ def remove_left_drafts(folder: Path, names: str) -> None:
     """Remove drafts left by killed processes; drafts that are being written stay.
 
     Drafts that cannot be removed, for example another user's, are left.
-
-    Args:
-        folder: where the files were to be.
-        names: of the files, as a glob pattern.
     """
     for left in folder.glob(f".{names}.*.draft"):
         with suppress(OSError):

@@ -43,9 +43,6 @@ class Drive:
     Attributes:
         step_m: (F,) float64, distance driven from the previous frame to this one, metres, >= 0.
         matched: (F,) bool, or numbers 0 and 1: whether this frame was localised.
-
-    Raises:
-        InputError: the arrays differ in length or hold invalid values.
     """
 
     step_m: NDArray[np.float64]
@@ -127,9 +124,7 @@ def failure(
     """P(X >= x): the one function for all failure estimators; see `FORMULAS`.
 
     Args:
-        drives: the localised sessions.
         at_m: distances x, metres; a number or an array.
-        estimator: what a failure is counted over.
 
     Returns:
         (N,) float64, or () for one distance, probabilities; 0 where nothing was driven or

@@ -37,12 +37,7 @@ class PluginGroup(Generic[T]):
         return sorted({entry.name for entry in self._entries()})
 
     def load(self, name: str) -> T:
-        """The thing of one of `names()`.
-
-        Raises:
-            IncompatibleError: its package cannot be imported, or what it names does not fit; or
-                several packages add that name.
-        """
+        """The thing of one of `names()`."""
         entries = [entry for entry in self._entries() if entry.name == name]
         if len(entries) > 1:
             packages = " and ".join(sorted(_package(entry) for entry in entries))
@@ -64,11 +59,7 @@ class PluginGroup(Generic[T]):
 
 
 def check_is(found: object, kind: type[T]) -> T:
-    """The object, if it is of that kind.
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """The object, if it is of that kind."""
     if isinstance(found, kind):
         return found
     raise ConfigError(
@@ -83,7 +74,6 @@ def _installed() -> Any:
 
 
 def _package(entry: EntryPoint) -> str:
-    """Name and version of the distribution that an entry belongs to."""
     return "a package" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
 
 

@@ -65,14 +65,8 @@ def run_in_processes(
     Args:
         work: a function of a module; its monitor forwards to `monitor`. Its process may end at any
             time; run again, it must continue from there.
-        tasks: name → task.
-        workers: number of concurrent processes.
         monitor: receives the words of all tasks; its `check` may end the work.
         done: called for each finished task with its name, result and number of dead workers.
-
-    Raises:
-        WorkerError: the workers of one task died repeatedly.
-        EngramError: raised by a task.
     """
     waiting = list(tasks)
     retries = dict.fromkeys(tasks, 0)
@@ -155,7 +149,6 @@ def _work(work: Callable[[Task, Monitor], Result], task: Task, pipe: Connection)
 
 
 def _listen(running: Sequence[_Running], monitor: Monitor) -> None:
-    """Waits for messages of the workers, at most `LISTEN_S`."""
     ready = wait(
         [one.pipe for one in running] + [one.process.sentinel for one in running], LISTEN_S
     )
@@ -165,7 +158,6 @@ def _listen(running: Sequence[_Running], monitor: Monitor) -> None:
 
 
 def _hear(one: _Running, monitor: Monitor) -> None:
-    """Receives all messages of a worker."""
     try:
         while one.pipe.poll():
             said = one.pipe.recv()

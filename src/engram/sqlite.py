@@ -75,10 +75,7 @@ class FileKind:
     """A kind of file.
 
     Attributes:
-        noun: its name in messages.
         application_id: number in the file's header that identifies the kind.
-        format_version: the one that is read.
-        metadata: its tables.
         strange: the error for a file that is not of this kind, or cannot be opened.
         cure: advice for a damaged file.
         busy_s: how long to wait for another process to release the file, seconds.
@@ -96,28 +93,14 @@ class FileKind:
 
 
 class SqliteFile:
-    """A file of a kind.
-
-    Args:
-        path: its path; the file may not exist yet.
-        kind: its kind.
-    """
+    """A file of a kind."""
 
     def __init__(self, path: Path, kind: FileKind) -> None:
         self.path = path
         self.kind = kind
 
     def check_regular(self, *, may_be_new: bool = False) -> None:
-        """Refuses files on which SQLite would block, or which it would take for an empty database.
-
-        Args:
-            may_be_new: whether the file may be empty or missing.
-
-        Raises:
-            EngramError: the kind's `strange`: not a regular file, or an empty one.
-            InputError: the folder of a new file is not there.
-            MapError: the file cannot be read, or made.
-        """
+        """Refuses files on which SQLite would block, or that it would take for an empty one."""
         noun, strange = self.kind.noun, self.kind.strange
         try:
             found = self.path.stat()
@@ -138,7 +121,6 @@ class SqliteFile:
             raise strange(f"{self.path} is an empty file, not a {noun}")
 
     def _check_place(self) -> None:
-        """Refuses a new file that cannot be made."""
         check_parent(self.path)
         if not os.access(self.path.parent, os.W_OK):
             raise MapError(f"{self.path} cannot be created: permission denied")
@@ -147,11 +129,6 @@ class SqliteFile:
         """Refuses files of another kind or format.
 
         Read through SQLite, since the log may be newer than the first page.
-
-        Raises:
-            EngramError: the kind's `strange`: a file of another kind.
-            FormatVersionError: written by an Engram that is newer, or much older.
-            MapCorruptError: the format does not exist.
         """
         kind = self.kind
         if self._pragma(execute, "application_id") != kind.application_id:
@@ -189,9 +166,6 @@ class SqliteFile:
 
         Args:
             execute: `execute` of an open connection.
-
-        Raises:
-            MapCorruptError: other tables, or other columns.
         """
         for name, definition in execute("SELECT name, sql FROM sqlite_schema").fetchall():
             if definition is not None and not _PLAIN.fullmatch(str(definition)):
@@ -219,9 +193,6 @@ class SqliteFile:
 
         Args:
             options: of SQLite's URI: ``mode=ro``, ``mode=rw`` or ``mode=rwc``.
-
-        Raises:
-            MapError: this Python's SQLite is too old, or does not take the path.
         """
         if sqlite3.sqlite_version_info < _OLDEST_SQLITE:
             raise MapError(

@@ -16,11 +16,7 @@ _PLAIN = re.compile(r"[\n\x20-\x7e]*")
 
 
 def open_regular(path: Path, error: type[InputError] = SequenceError) -> int:
-    """A descriptor of a regular file, opened for reading; never waits at a pipe.
-
-    Raises:
-        InputError: of the given kind: it is missing, unreadable, or not a regular file.
-    """
+    """A descriptor of a regular file, opened for reading; never waits at a pipe."""
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:
@@ -34,11 +30,7 @@ def open_regular(path: Path, error: type[InputError] = SequenceError) -> int:
 
 
 def read_bytes(path: Path, most: int, error: type[InputError] = SequenceError) -> bytes:
-    """The content of a regular file of at most `most` bytes.
-
-    Raises:
-        InputError: of the given kind: it is missing, unreadable, not regular, or too large.
-    """
+    """The content of a regular file of at most `most` bytes."""
     with os.fdopen(open_regular(path, error), "rb") as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
@@ -52,11 +44,7 @@ def read_bytes(path: Path, most: int, error: type[InputError] = SequenceError) -
 def read_text(
     path: Path, error: type[InputError] = SequenceError, most: int = _MAX_TEXT_BYTES
 ) -> str:
-    """The text of a regular file.
-
-    Raises:
-        InputError: of the given kind: as for `read_bytes`, or it is not UTF-8 text.
-    """
+    """The text of a regular file."""
     try:
         return read_bytes(path, most, error).decode("utf-8-sig")
     except UnicodeDecodeError as fault:

@@ -28,7 +28,6 @@ class Cameras:
     """A calibrated stereo pair.
 
     Attributes:
-        camera: the rectified pair.
         rectification: tables for raw images; None for images that come rectified.
         raw: the raw calibration behind the tables, if it has lenses of a known model.
         field_of_view_deg: chosen horizontal field of view of the rectified images; None for the
@@ -55,11 +54,7 @@ def rectified_cameras(
     field_of_view_deg: float | None = None,
     topics: tuple[str, str] | None = None,
 ) -> Cameras:
-    """The cameras of a raw calibration.
-
-    Raises:
-        CalibrationError: it cannot be rectified.
-    """
+    """The cameras of a raw calibration."""
     rectification = rectify(raw, field_of_view_deg)
     return Cameras(rectification.camera, rectification, raw, field_of_view_deg, topics)
 
@@ -75,9 +70,6 @@ def cameras_in_order(
         chain: the first camera as `left`, the second as `right`, whichever they are.
         field_of_view_deg: of the rectified images; None for the largest.
         topics: image topics of the first and the second camera.
-
-    Raises:
-        CalibrationError: they are not a stereo pair.
     """
     if not chain.is_exchanged:
         return rectified_cameras(chain, field_of_view_deg, topics)
@@ -113,11 +105,7 @@ _IDEAL_AT_ZERO = ("inverse_brown_conrady", "modified_brown_conrady")
 
 
 def read_yaml(text: str) -> dict[str, Any]:
-    """The table of a YAML text; values are strings, lists and tables.
-
-    Raises:
-        CalibrationError: the text is not YAML, holds no table, or is too long.
-    """
+    """The table of a YAML text; values are strings, lists and tables."""
     # OpenCV writes "%YAML:1.0", which is not a valid YAML directive.
     text = "\n".join(line for line in text.splitlines() if not line.startswith("%"))
     if len(text) > MAX_CHARACTERS:
@@ -142,11 +130,7 @@ def _characters(value: Any, known: dict[int, int]) -> int:
     """Length of a YAML text if its aliases were expanded; nothing is expanded here.
 
     Args:
-        value: of the base loader.
         known: lengths by identity; 0 while one is counted.
-
-    Raises:
-        ValueError: something holds itself.
     """
     if not isinstance(value, list | dict):
         return 1 + len(value or "")
@@ -161,22 +145,14 @@ def _characters(value: Any, known: dict[int, int]) -> int:
 
 
 def entry(entries: dict[str, Any], name: str) -> Any:
-    """The value of a name.
-
-    Raises:
-        CalibrationError: it is missing.
-    """
+    """The value of a name."""
     if name not in entries:
         raise CalibrationError(f"entry {name} is missing")
     return entries[name]
 
 
 def numbers(entries: dict[str, Any], name: str, counts: set[int]) -> list[float]:
-    """The finite numbers of a list, a nested list, or a matrix written as a table with `data`.
-
-    Raises:
-        CalibrationError: it is missing, has another count, or an entry that is not a number.
-    """
+    """The finite numbers of a list, a nested list, or a matrix written as a table with `data`."""
     values = entry(entries, name)
     if isinstance(values, dict):
         values = entry(values, "data")
@@ -195,22 +171,14 @@ def numbers(entries: dict[str, Any], name: str, counts: set[int]) -> list[float]
 
 
 def whole(value: float, name: str = "resolution") -> int:
-    """A number of pixels.
-
-    Raises:
-        CalibrationError: it is not whole or not positive.
-    """
+    """A number of pixels."""
     if not (0 < value < 1e6 and value == int(value)):
         raise CalibrationError(f"{name} holds {value:g}, must be whole numbers of pixels > 0")
     return int(value)
 
 
 def pixels(entries: dict[str, Any], name: str) -> int:
-    """A number of pixels that stands alone.
-
-    Raises:
-        CalibrationError: it is missing, or not a whole number > 0.
-    """
+    """A number of pixels that stands alone."""
     try:
         return whole(float(entry(entries, name)), name)
     except (TypeError, ValueError, OverflowError):
@@ -218,21 +186,13 @@ def pixels(entries: dict[str, Any], name: str) -> int:
 
 
 def transform(entries: dict[str, Any], name: str) -> SE3:
-    """A rigid transform of 16 (or 12) numbers.
-
-    Raises:
-        CalibrationError: it is missing or not rigid.
-    """
+    """A rigid transform of 16 (or 12) numbers."""
     matrix = np.array(numbers(entries, name, {12, 16})).reshape(-1, 4)
     return rigid(matrix, name)
 
 
 def rigid(matrix: NDArray[np.float64], name: str) -> SE3:
-    """A rigid transform from a (3, 4) or (4, 4) matrix, its translation in m.
-
-    Raises:
-        CalibrationError: it is not rigid.
-    """
+    """A rigid transform from a (3, 4) or (4, 4) matrix, its translation in m."""
     try:
         return SE3.from_matrix(matrix)
     except ValueError as error:
@@ -240,11 +200,7 @@ def rigid(matrix: NDArray[np.float64], name: str) -> SE3:
 
 
 def distortion_model(value: Any, name: str = "distortion_model") -> DistortionModel:
-    """The lens model of a name.
-
-    Raises:
-        CalibrationError: it is unknown or not supported.
-    """
+    """The lens model of a name."""
     text = _model_name(value)
     if text not in _DISTORTION:
         known = ", ".join(name for name in _DISTORTION if name)
@@ -268,11 +224,7 @@ def lens_of(
     """Model and coefficients of a lens; those of a model that is not read may all be zero.
 
     Args:
-        model: name of the model.
         values: reads the coefficients; is given the allowed counts.
-
-    Raises:
-        CalibrationError: the model is unknown, or the coefficients do not fit it.
     """
     if _model_name(model) in _IDEAL_AT_ZERO and not any(values({4, 5, 8, 12, 14})):
         return DistortionModel.NONE, ()
@@ -282,15 +234,7 @@ def lens_of(
 def coefficients(
     model: DistortionModel, values: Callable[[set[int]], list[float]]
 ) -> tuple[DistortionModel, tuple[float, ...]]:
-    """Model and coefficients in Engram's form; zeros of an ideal lens are no distortion.
-
-    Args:
-        model: the stated model.
-        values: reads the list; is given the allowed counts.
-
-    Raises:
-        CalibrationError: the lens has terms that are not supported.
-    """
+    """Model and coefficients in Engram's form; zeros of an ideal lens are no distortion."""
     if model is DistortionModel.NONE:
         return model, ()
     fisheye = model is DistortionModel.EQUIDISTANT

@@ -54,12 +54,7 @@ def is_camchain(entries: dict[str, Any]) -> bool:
 
 
 def parse_camchain(entries: dict[str, Any], field_of_view_deg: float | None = None) -> Cameras:
-    """The first two cameras of a chain, in either order, and their image topics.
-
-    Raises:
-        CalibrationError: an entry is missing, malformed, or of a kind that is not supported; or the
-            cameras are not a stereo pair.
-    """
+    """The first two cameras of a chain, in either order, and their image topics."""
     sides = [entry(entries, name) for name in ("cam0", "cam1")]
     lenses = []
     for name, side in zip(("cam0", "cam1"), sides, strict=True):
@@ -119,11 +114,7 @@ def parse_file_storage(
     """The pair of a file, or of two files whose entries are joined.
 
     Args:
-        entries: the entries.
         size: gives that of the drive's images, px, which the sample's files do not state.
-
-    Raises:
-        CalibrationError: an entry is missing or malformed.
     """
     names = next((names for names in _SPELLINGS if names[0] in entries), None)
     if names is None or not {"R", "T"} <= entries.keys():
@@ -188,12 +179,9 @@ class CameraInfo:
 
     Attributes:
         width, height: image size, px.
-        model: model of the lens.
-        d: its coefficients.
         k: (3, 3) float64, intrinsics of the raw image, px.
         r: (3, 3) float64, rotation of the raw camera to the rectified one.
         p: (3, 4) float64, projection of the rectified image, px and px·m.
-        frame: name of the camera's frame.
     """
 
     width: int
@@ -217,11 +205,7 @@ class CameraInfo:
         return not any(self.d) and bool(same) and bool(np.abs(self.r - np.eye(3)).max() < 1e-6)
 
     def completed(self) -> CameraInfo:
-        """With what drivers leave at zero: an ideal camera's K from P, its P from K, and R.
-
-        Raises:
-            CalibrationError: it is not calibrated.
-        """
+        """With what drivers leave at zero: an ideal camera's K from P, its P from K, and R."""
         k, r, p = self.k, self.r, self.p
         if not (k[0, 0] > 0 or p[0, 0] > 0):
             raise CalibrationError("is not calibrated: its camera matrix holds only zeros")
@@ -235,11 +219,7 @@ class CameraInfo:
 
     @property
     def lens(self) -> RawCamera:
-        """The raw camera.
-
-        Raises:
-            CalibrationError: it is not calibrated.
-        """
+        """The raw camera."""
         model, d = self.model, self.d
         if model is DistortionModel.RADIAL_TANGENTIAL and not any(d):
             model, d = DistortionModel.NONE, ()
@@ -257,11 +237,7 @@ class CameraInfo:
 
 
 def parse_camera_info(entries: dict[str, Any]) -> CameraInfo:
-    """The YAML of `camera_calibration`.
-
-    Raises:
-        CalibrationError: an entry is missing or malformed.
-    """
+    """The YAML of `camera_calibration`."""
     model, d = lens_of(
         entries.get("distortion_model", "plumb_bob"),
         lambda counts: numbers(entries, "distortion_coefficients", counts),
@@ -295,15 +271,10 @@ def cameras_of_infos(
     """The stereo pair of two `CameraInfo`.
 
     Args:
-        left, right: the two cameras.
         rectified: whether the images are the rectified ones (`image_rect`).
         right_from_left: relative pose of the raw cameras, metres, if known from elsewhere; used if
             `P` states no baseline.
-        left_from_rig: mounting of the left camera, if known.
         field_of_view_deg: of the rectified images, if raw ones are rectified here.
-
-    Raises:
-        CalibrationError: it is not a calibrated stereo pair.
     """
     _check_sizes(left, right)
     stated = left.projects and right.projects
@@ -345,12 +316,7 @@ def _check_sizes(left: CameraInfo, right: CameraInfo) -> None:
 
 
 def _seen_through_p(info: CameraInfo, *, stated: bool) -> CameraInfo:
-    """The camera of rectified images, whose projection is all that counts.
-
-    Args:
-        info: the camera; K stands for P where that is zero.
-        stated: whether P is not zero.
-    """
+    """The camera of rectified images, whose projection is all that counts."""
     if not stated and any(info.d):
         raise CalibrationError(
             "the images are rectified, but P, which describes rectified images, is zero; name the "
@@ -473,9 +439,6 @@ def read_calibration(
         rectified: whether the drive's images are rectified, for formats that describe both.
         size: gives that of the drive's images, px, for formats that state none.
         field_of_view_deg: of the rectified images; None for that of the file.
-
-    Raises:
-        CalibrationError: it is missing, malformed, of an unknown format, or not of a stereo pair.
     """
     text = read_text(path, CalibrationError, 4 * MAX_CHARACTERS)
     try:
@@ -500,11 +463,6 @@ def read_calibration(
 
 
 def _partner(path: Path) -> dict[str, Any]:
-    """The entries of the file that belongs to this one.
-
-    Raises:
-        CalibrationError: that file is missing.
-    """
     partner = _partner_path(path)
     if partner is None:
         raise CalibrationError(

@@ -47,7 +47,6 @@ class RawTable:
         width, height: image size, px.
         right_from_left: 16 numbers, row-major 4×4: pose of the left camera in the frame of the
             right one, metres.
-        left, right: the two lenses.
         field_of_view_deg: horizontal field of view of the rectified images; missing for the
             largest.
     """
@@ -65,12 +64,9 @@ class CalibrationFile:
     """`calibration.toml`: one of `[rectified]` and `[raw]`, and facts of the drive.
 
     Attributes:
-        rectified, raw: the cameras; exactly one of the two.
         cam_from_rig: 16 numbers, row-major 4×4: mounting of the left camera (of the stored images),
             metres; missing if unknown.
         clock: meaning of the stamps: utc, relative, unknown.
-        robot: name of the robot.
-        longitude_deg, zone: where the drive was.
     """
 
     rectified: RectifiedTable | None = None
@@ -86,10 +82,6 @@ class CalibrationFile:
 
         Args:
             field_of_view_deg: replaces that of `[raw]`.
-
-        Raises:
-            ConfigError: not exactly one of the tables is given, or a matrix is malformed.
-            CalibrationError: the cameras are not a stereo pair.
         """
         mounting = _transform("cam_from_rig", self.cam_from_rig)
         rectified, raw = self.rectified, self.raw
@@ -107,21 +99,12 @@ class CalibrationFile:
 
 
 def parse_toml(text: str, field_of_view_deg: float | None = None) -> Cameras:
-    """The stereo pair of a `calibration.toml`.
-
-    Raises:
-        ConfigError: the text is malformed.
-        CalibrationError: the cameras are not a stereo pair.
-    """
+    """The stereo pair of a `calibration.toml`."""
     return load_toml(text, CalibrationFile).cameras(field_of_view_deg)
 
 
 def calibration_toml(cameras: Cameras) -> str:
-    """A calibration as TOML text that `parse_toml` reads as equal cameras.
-
-    Raises:
-        CalibrationError: the lenses are given by tables of pixels, without a model.
-    """
+    """A calibration as TOML text that `parse_toml` reads as equal cameras."""
     raw, camera = cameras.raw, cameras.camera
     if raw is not None:
         return _raw_toml(raw, cameras.field_of_view_deg)

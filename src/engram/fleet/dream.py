@@ -46,7 +46,6 @@ class Try:
 
     Attributes:
         place: folder of its results; what is there already is not tried again.
-        handed: the robots' maps.
         judge, settings, merging: see `find_best_order`.
         end_s: `time.time` at which trying ends; None: when all is tried.
     """
@@ -77,11 +76,7 @@ class _Deadline:
 
 
 def try_orders(asked: Try, monitor: Monitor) -> bool:
-    """Tries the orders of one method of merging; whether it came to the end.
-
-    Raises:
-        KeyboardInterrupt: the monitor stopped it, rather than the time.
-    """
+    """Tries the orders of one method of merging; whether it came to the end."""
     deadline = _Deadline(asked.end_s)
     watched = Relay(monitor, deadline.check)
     try:
@@ -101,15 +96,10 @@ def try_all(
     """Tries all ways of merging; whether all came to the end.
 
     Args:
-        asked: ways of merging by name.
         workers: processes on this machine; with one, all is tried here.
         scheduler: address of a Dask scheduler, whose workers try instead; they read the validation
             drives themselves, and get the maps over the network.
         monitor: receives progress per order, and may stop it.
-
-    Raises:
-        KeyboardInterrupt: the monitor stopped it.
-        WorkerError: workers died repeatedly, or the scheduler cannot be reached.
     """
     if scheduler is None and workers == 1:
         return all(try_orders(one, monitor) for one in asked.values())
@@ -183,8 +173,6 @@ def _write_results(place: Path, results: Mapping[str, bytes]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Judgement:
-    """One drive in one map, which is not changed."""
-
     centre: Path
     drive: Path
     settings: Settings
@@ -202,18 +190,11 @@ def localised_in(
     """Localises each drive in each map.
 
     Args:
-        maps, drives: by number.
-        settings, localising: of the localiser; policy and budget.
         workers: processes, a drive in a map each; with one, all is done here.
         monitor: receives progress, a step for each drive in each map, and may stop it.
 
     Returns:
         For each map, the results of the drives, in their order.
-
-    Raises:
-        KeyboardInterrupt: the monitor stopped it.
-        WorkerError: a worker died repeatedly.
-        EngramError: a map or a drive cannot be read.
     """
     asked = {
         f"drive {at + 1} in {centre}": _Judgement(centre, drive, settings, localising)
@@ -277,12 +258,8 @@ class DreamOptions:
     """How a fleet map dreams.
 
     Attributes:
-        minutes, judge_at_m, resamples, level, seed: see their descriptions.
         workers: processes that try behaviours, and judge the best result, side by side.
         scheduler: address of a Dask scheduler whose workers try instead.
-        merging: how robots' maps are merged usually.
-        localising: policy and budget of the validation.
-        estimator: what orders are judged over.
     """
 
     minutes: Annotated[
@@ -311,15 +288,12 @@ class DreamReport:
     """Result of a dream.
 
     Attributes:
-        centre: the fleet map.
-        tried: results by behaviour; best order first.
         complete: whether everything was tried; otherwise the same command continues.
         behaviour, order: of the best result; order by numbers of the hand-ins.
         missed_before, missed_after: share of the validation drives' route without a match, in the
             fleet map and with what the best result adds.
         better_by: the difference with its interval (estimate, low, high).
         added: what was added; None if nothing was better.
-        seconds: of this run.
     """
 
     centre: str
@@ -376,18 +350,9 @@ def dream(
     same result. They are removed once everything has been tried.
 
     Args:
-        centre: the fleet map.
         handed: robots' maps as they were handed in, oldest first (`hand_ins_of`).
-        drives: validation drives, in none of the maps.
         settings: of the localiser; None for the defaults.
-        options: time, behaviours' base, judgement.
         monitor: receives progress; its `check` is called between two merges.
-
-    Raises:
-        ConfigError: there are too few drives, or one is not held out.
-        InputError: nothing was handed in.
-        MapError: a map cannot be read or written. The fleet map is unchanged.
-        KeyboardInterrupt: it was interrupted; what was tried is kept.
     """
     options, settings = options or DreamOptions(), settings or Settings()
     _check(centre, handed, drives)
@@ -440,7 +405,6 @@ class _Dream:
     options: DreamOptions
 
     def folder(self) -> Path:
-        """Folder of the results of exactly these inputs."""
         hashes = []
         for path in self.handed:
             with Map.open(path) as store:
@@ -510,15 +474,8 @@ def hand_ins_of(centre: Path) -> list[Path]:
 def keep_hand_in(centre: Path, robot: Path) -> Path:
     """Keeps a copy of a robot's map; one of the same content is kept once.
 
-    Args:
-        centre: the fleet map.
-        robot: the map that was handed in.
-
     Returns:
         The kept copy, NUMBER-CONTENT.engram.
-
-    Raises:
-        MapError: it cannot be read, or not be written there.
     """
     with Map.open(robot) as store:
         content = store.content_hash()

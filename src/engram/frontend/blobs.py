@@ -61,9 +61,6 @@ def pixel_quantum(width: int, height: int = 1) -> float:
     """Step of stored pixels and disparities for an image of this size, px.
 
     The smallest power of two, at least 1/64, for which the longer side fits into 16 bits.
-
-    Raises:
-        InputError: a side is not positive or longer than 65535 px.
     """
     side = max(width, height)
     if min(width, height) < 1 or side > _LARGEST_CODE:
@@ -85,9 +82,6 @@ def quantise(
         disparity_px: (N,) float32, px, > 0; values that round to zero become one quantum.
         disparity_sigma_px: (N,) float32, px, > 0; limited to the range of `SIGMA_TABLE_PX`.
         quantum_px: `pixel_quantum` of the image.
-
-    Raises:
-        InputError: a pixel or disparity is not finite, negative or too large for 16 bits.
     """
     steps_per_px = np.float32(1 / quantum_px)  # a power of two: the product is exact
     pixel_steps = np.rint(pixels * steps_per_px)
@@ -131,10 +125,6 @@ def quantised_landmarks(
         disparity_px, disparity_sigma_px: (N,) float32, px.
         descriptors: (N, B) uint8.
         octaves: (N,) uint8.
-        camera: the camera that saw them.
-
-    Raises:
-        InputError: a pixel or disparity is not finite, negative or too large for 16 bits.
     """
     quantum_px = pixel_quantum(camera.width, camera.height)
     quantised = _core.quantise_landmarks(
@@ -202,10 +192,6 @@ def encode_landmarks(landmarks: Landmarks, camera: StereoCamera) -> bytes:
 
     Args:
         landmarks: landmarks of the front-end, in the quanta of `camera`'s image.
-        camera: the camera of the frame.
-
-    Raises:
-        InputError: the landmarks are not exactly representable by their codes.
     """
     quantum_px = pixel_quantum(camera.width, camera.height)
     codes = quantise(
@@ -232,13 +218,6 @@ def decode_landmarks(blob: bytes, camera: StereoCamera, kind: DescriptorKind) ->
 
     Args:
         blob: a result of `encode_landmarks`, of any origin.
-        camera: the camera of the frame.
-        kind: kind of its descriptors.
-
-    Raises:
-        IncompatibleError: the kind is unknown.
-        MapCorruptError: the bytes do not match their hash, are not a landmark blob of a known
-            version, or hold invalid values.
     """
     body = blob[HASH_BYTES:]
     if len(blob) < HASH_BYTES or content_digest(body) != blob[:HASH_BYTES]:
@@ -266,11 +245,7 @@ def is_intact(blob: bytes) -> bool:
 
 
 def encode_thumbnail(thumbnail: NDArray[np.uint8]) -> bytes:
-    """A (h, w) uint8 grey picture as JPEG, for people to look at.
-
-    Raises:
-        InputError: not a (h, w) uint8 array with sides of 1 to 1024 px.
-    """
+    """A (h, w) uint8 grey picture as JPEG, for people to look at."""
     if (
         thumbnail.ndim != 2
         or thumbnail.dtype != np.uint8
@@ -285,11 +260,7 @@ def encode_thumbnail(thumbnail: NDArray[np.uint8]) -> bytes:
 
 
 def decode_thumbnail(data: bytes) -> NDArray[np.uint8]:
-    """The (h, w) uint8 grey picture of `encode_thumbnail`.
-
-    Raises:
-        MapCorruptError: the bytes are not a JPEG picture of at most 1024 px.
-    """
+    """The (h, w) uint8 grey picture of `encode_thumbnail`."""
     if not data.startswith(b"\xff\xd8") or not _jpeg_is_small(data):
         raise MapCorruptError(f"thumbnail of {len(data)} bytes is not a small JPEG picture")
     try:

@@ -61,9 +61,6 @@ def weights() -> Mapping[str, NDArray[Any]]:
     """The arrays of `engram._core.PatchNetwork`, by the names of its arguments.
 
     Four (out, side, side, in) int8 layers of weights; the rest int32, (n,) factors and limits.
-
-    Raises:
-        IncompatibleError: the installed file is not the model that this version names.
     """
     body = (resources.files("engram.frontend") / "data" / _FILE).read_bytes()
     found = hashlib.sha256(body).hexdigest()[: len(MODEL)]
@@ -163,7 +160,6 @@ class FeatureKind:
         name: its name in maps and frame logs; `NAME@MODEL` where a learned model describes, MODEL
             being a hash of its weights. Settings and commands may leave out the model.
         descriptor_bytes: width of a descriptor, a multiple of 8 up to 2048.
-        detect: finds the landmarks.
         describe: describes them, if `detect` does not.
         matcher: suitable matcher settings; they replace those left at their defaults.
         good_at: what to choose it for, in a few words.
@@ -247,9 +243,6 @@ def describe_teblid(
 
     Source: Suárez et al., Revisiting Binary Local Image Description for Resource Limited Devices,
     RA-L 2021.
-
-    Raises:
-        MissingExtraError: OpenCV is installed without its contrib modules.
     """
     import cv2
 
@@ -311,15 +304,7 @@ FEATURES: dict[DescriptorKind, FeatureKind] = {
 
 
 def feature_kind(name: str) -> FeatureKind:
-    """The kind of that name, from the table or an installed package.
-
-    Args:
-        name: with or without its model.
-
-    Raises:
-        IncompatibleError: the kind is unknown, its model is another one here, or the package that
-            adds it cannot be used.
-    """
+    """The kind of that name, from the table or an installed package."""
     known = FEATURES.get(DescriptorKind(name))
     if known is not None:
         return known
@@ -373,11 +358,6 @@ def fitted_matcher(
 
     Args:
         matcher: settings for features of the kind `before`.
-        before: that kind.
-        kind: the new kind.
-
-    Raises:
-        IncompatibleError: a kind is unknown.
     """
     untouched = (MatcherConfig(), feature_kind(before).matcher)
     suited = feature_kind(kind).matcher

@@ -80,9 +80,6 @@ class Frame:
 
     Attributes:
         stamp_ns: capture time, ns.
-        camera: the camera of the pair.
-        landmarks: its 3D landmarks (possibly none).
-        descriptor: the kind of the landmarks' descriptors.
         frontend: hash of the front-end's version and configuration.
         status: `FrameStatus.OK`, or why the frame is unusable.
         thumbnail: (h, w) uint8 grey, at most 160 px wide, for people to look at; None if not

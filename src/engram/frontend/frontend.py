@@ -40,7 +40,6 @@ def clear_of_body(found: Keypoints, mask: NDArray[np.bool_]) -> Keypoints:
     """The corners that are clear of the body.
 
     Args:
-        found: N corners.
         mask: (height, width) bool, False on the body.
     """
     clear_px = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
@@ -139,7 +138,6 @@ class Frontend:
     """Makes frames from stereo pairs. Stateless between frames; usable from any thread.
 
     Attributes:
-        config: its settings.
         hash: 12 hexadecimal digits of version and settings, recorded in every frame.
     """
 
@@ -150,12 +148,7 @@ class Frontend:
         )
 
     def extract(self, pair: StereoPair) -> Frame:
-        """Corners with a disparity, their descriptors and points; image content never raises.
-
-        Raises:
-            SequenceError: the images are not uint8 arrays of the camera's size, or smaller than
-                64 px.
-        """
+        """Corners with a disparity, their descriptors and points; image content never raises."""
         check_pair(pair)
         pair, config = without_body(pair), self.config
         kind = feature_kind(config.descriptor)
@@ -215,12 +208,7 @@ def _settings_hash(config: FrontendConfig) -> str:
 
 
 def check_pair(pair: StereoPair) -> None:
-    """Refuses a pair that no front-end can read.
-
-    Raises:
-        SequenceError: the stamp is not an integer of 64 bits, there is no camera, or the images are
-            not uint8 arrays of the camera's size, or smaller than 64 px.
-    """
+    """Refuses a pair that no front-end can read."""
     stamp_ns: object = pair.stamp_ns
     if not isinstance(stamp_ns, int | np.integer) or not -(2**63) <= stamp_ns < 2**63:
         raise SequenceError(

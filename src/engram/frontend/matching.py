@@ -71,8 +71,6 @@ class MatcherConfig:
             and of the rotation. Source: KITTI; motion capture of EuRoC.
         min_consensus: fewest landmarks of a pose; any three agree on some pose. The localiser
             accepts a match by a higher threshold.
-        max_samples, max_hypotheses, min_followers: see their descriptions.
-        glance_share, glance_samples, glance_consensus, glance_inliers: see their descriptions.
         confidence: stop drawing once a better pose is less likely than one minus this.
         max_view_angle_rad: largest angle between the optical axes of a valid pose: the view gate of
             method §3.1 with a margin. Beyond it images overlap only at their edges.
@@ -177,7 +175,6 @@ class Question:
     """What a live frame is matched with: the arguments of `match_frames`.
 
     Attributes:
-        reference, config, seed, predicted: see there.
         predicted_covariance: (6, 6) float64 of `predicted`, left perturbation, [translation m,
             rotation rad].
     """
@@ -221,17 +218,11 @@ def match_frames(
 
     Args:
         reference: the reference frame; its camera may differ from the live one.
-        live: the live frame.
-        config: the settings.
         seed: seed of the random draws, 0 … 2⁶⁴ − 1; see `pair_seed`.
         predicted: predicted reference_from_live; only landmarks near their predicted pixels are
             then compared. None to search the whole frame.
         predicted_covariance: (6, 6) float64 of `predicted`, left perturbation, [translation,
             rotation]; required with it.
-
-    Raises:
-        IncompatibleError: the frames have different kinds of descriptors.
-        InputError: a prediction without covariance, or the reverse.
 
     Source: method §2.4–2.6.
     """
@@ -288,11 +279,7 @@ def features(frame: Frame) -> _core.Features:
 
 
 def check_same_kind(reference: Frame, live: Frame) -> None:
-    """Refuses two frames whose descriptors cannot be compared.
-
-    Raises:
-        IncompatibleError: the frames have different kinds of descriptors.
-    """
+    """Refuses two frames whose descriptors cannot be compared."""
     if reference.descriptor != live.descriptor:
         raise IncompatibleError(
             f"cannot match {live.descriptor} descriptors with {reference.descriptor}: "

@@ -17,9 +17,6 @@ def xfeatures2d(user: str) -> Any:
 
     Args:
         user: what needs it, the subject of the error's sentence.
-
-    Raises:
-        MissingExtraError: the wheel that owns `cv2` does not have it.
     """
     module = getattr(cv2, "xfeatures2d", None)
     if not hasattr(module, "TEBLID_create"):

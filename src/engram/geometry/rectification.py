@@ -62,11 +62,7 @@ class RawCamera:
     Attributes:
         fx, fy, cx, cy: intrinsics, px; pixel centres at integers.
         width, height: image size, px.
-        distortion: model of the lens.
         coefficients: coefficients of the model, see `DistortionModel`.
-
-    Raises:
-        CalibrationError: a value is not finite, not positive, or their number does not fit.
     """
 
     fx: float
@@ -118,7 +114,6 @@ class RawStereoCalibration:
     """Two raw cameras and their relative pose.
 
     Attributes:
-        left, right: the two cameras, of equal image size.
         right_from_left: pose of the left raw camera in the frame of the right one, metres.
         left_from_rig: mounting of the left raw camera on the robot, if known.
     """
@@ -177,7 +172,6 @@ class Rectification:
     Attributes:
         camera: the rectified pair; its `rectification` is the hash of the raw calibration.
         rectified_from_raw: rotation of the left camera about its centre.
-        left, right: the tables for the two images.
     """
 
     camera: StereoCamera
@@ -192,13 +186,8 @@ def rectify(
     """Rectifies a raw stereo calibration; keeps the image size.
 
     Args:
-        calibration: the two lenses and their relative pose.
         field_of_view_deg: horizontal field of view of the rectified images; None crops all unseen
             borders, and for a fisheye ends at 100°.
-
-    Raises:
-        CalibrationError: the two sizes differ, the right camera is not to the right of the left
-            one, no usable image remains, or the field of view is not within 10° to 170°.
     """
     left, right = calibration.left, calibration.right
     _check_pair(calibration)
@@ -338,7 +327,6 @@ def _seeing(
 
 
 def _float64(*arrays: ArrayLike) -> list[NDArray[np.float64]]:
-    """OpenCV's results with their types."""
     return [np.asarray(array, dtype=np.float64) for array in arrays]
 
 

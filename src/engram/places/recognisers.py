@@ -73,7 +73,6 @@ class Comparison:
         evidence: (P,) float64, log-likelihoods relative to those of other images at the place;
             similarities, 0…1, from a recogniser without probabilities. Each is independent of the
             other places.
-        new_place: see `Recognition`.
     """
 
     evidence: NDArray[np.float64]
@@ -116,7 +115,6 @@ class PlaceRecogniser(Protocol):
 
         Args:
             words: (n,) int32, the distinct words of the image, increasing; possibly none.
-            count: most places to return.
         """
         ...
 
@@ -126,11 +124,7 @@ class ReadsFrames(Protocol):
     """A `PlaceRecogniser` that compares something else of images than their words."""
 
     def signature(self, frame: Frame) -> NDArray[np.int32]:
-        """(n,) int32: what `add`, `compare` and `recognise` take for this image instead of words.
-
-        Raises:
-            IncompatibleError: its landmarks are of another kind.
-        """
+        """(n,) int32: what `add`, `compare` and `recognise` take for an image instead of words."""
         ...
 
 
@@ -196,14 +190,7 @@ _PLACE_LACKS, _IMAGE_LACKS = 0b01010101, 0b00110011
 
 
 class Signatures:
-    """A `PlaceRecogniser` by the bits that signatures have in common. It reports no new places.
-
-    Args:
-        vocabulary: of a kind that has signatures.
-
-    Raises:
-        IncompatibleError: the kind has none, or they are of another model.
-    """
+    """A `PlaceRecogniser` by the bits that signatures have in common. It reports no new places."""
 
     name = "signature"
 
@@ -224,11 +211,7 @@ class Signatures:
         return _COLUMNS * int(self._centres.size)
 
     def signature(self, frame: Frame) -> Signature:
-        """(n,) int32: what a frame shows, for `add`, `compare` and `recognise`.
-
-        Raises:
-            IncompatibleError: its landmarks are of another kind.
-        """
+        """(n,) int32: what a frame shows, for `add`, `compare` and `recognise`."""
         if frame.descriptor != self._kind:
             raise IncompatibleError(
                 f"a frame of kind {frame.descriptor} has no signature of kind {self._kind}: "
@@ -352,13 +335,7 @@ class ObservationModel:
     def of(
         statistics: WordStatistics, detector: DetectorModel, *, naive: bool = False
     ) -> ObservationModel:
-        """The model of a vocabulary.
-
-        Args:
-            statistics: statistics of the vocabulary.
-            detector: detection rates of the front-end.
-            naive: treat words as independent (naive Bayes).
-        """
+        """The model of a vocabulary."""
         parents = np.full_like(statistics.parents, -1) if naive else statistics.parents
         p_seen, p_given_parent = _probabilities(statistics)
         sight = np.array(  # [e][z]
@@ -390,7 +367,6 @@ def place_beliefs(p_seen: NDArray[np.float64], detector: DetectorModel) -> NDArr
 
     Args:
         p_seen: (W,) float64, probability p(z_q = 1).
-        detector: detection rates of the front-end.
 
     Source: [C08] §4.4.
     """
@@ -437,7 +413,6 @@ def _given_existence(
         p_seen: (W,) float64, probability p(z_q = 1).
         p_given_parent: (W,) float64, p(z_q = 1 | z_parent).
         sight: (2,) float64, p(z = 0 | e) and p(z = 1 | e) for the given existence e.
-        z: whether the word is seen.
         parents: (W,) int32; for roots, -1, only the detector counts.
 
     Source: [C08] §4.3.
@@ -455,10 +430,8 @@ class FabMapConfig:
     """Settings of FAB-MAP.
 
     Attributes:
-        detector: detection rates of the front-end.
         new_place_prior: prior probability that an image shows none of the places: a lost robot is
             as likely to be somewhere new.
-        naive_bayes: treat words as independent instead of using the Chow-Liu tree.
     """
 
     detector: DetectorModel = field(default_factory=DetectorModel)
@@ -477,7 +450,6 @@ class FabMap:
 
     Args:
         vocabulary: words, their statistics, and samples of places outside the map.
-        config: settings.
     """
 
     name = "fabmap"
@@ -605,8 +577,6 @@ class _Weighed:
 
 
 class _QueryWeights:
-    """Turns the words of a query into weights of words."""
-
     def __init__(self, model: ObservationModel) -> None:
         unseen, seen = model.log_p
         gain = seen - unseen
@@ -627,8 +597,6 @@ class _QueryWeights:
 
 
 class _Likelihoods:
-    """Places, and the log-likelihood of a query at each."""
-
     def __init__(self, words: int, model: ObservationModel) -> None:
         self._index = _core.PlaceIndex(words)
         self._gain_unseen = model.log_p[1, 0] - model.log_p[0, 0]
@@ -653,7 +621,6 @@ class _Likelihoods:
         return float(self._base[number])
 
     def of(self, query: _Weighed) -> NDArray[np.float64]:
-        """(P,) float64."""
         sums = self._base[: len(self)] + query.constant
         self._index.add_weights(query.words, query.weights, sums)
         return sums

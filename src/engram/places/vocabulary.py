@@ -62,11 +62,7 @@ class TreeArrays:
         return self.centres[np.flatnonzero(np.diff(self.bounds) == 0)]
 
     def searchable(self) -> _core.WordTree:
-        """The tree in the form that the core searches.
-
-        Raises:
-            InputError: the arrays do not form a tree.
-        """
+        """The tree in the form that the core searches."""
         try:
             return _core.WordTree(self.centres, self.bounds)
         except (TypeError, ValueError) as error:
@@ -91,9 +87,7 @@ def grow_tree(
     Args:
         descriptors: (N, B) uint8, N > 0.
         words: number of leaves; there are fewer if descriptors are equal or few.
-        depth: levels below the root.
         iterations: most of Lloyd's iterations per cluster.
-        seed: seed of the first centres.
         monitor: receives the stage `cluster`, one item per cluster.
     """
     branching = round(words ** (1 / depth))
@@ -185,7 +179,6 @@ def learn_statistics(
 
     Args:
         images: the distinct words, (n,) int32, of each training image.
-        words: size of the vocabulary, W.
         monitor: receives the stage `relate`, one item per block of rows.
     """
     from scipy.sparse import csr_array
@@ -308,9 +301,6 @@ class Vocabulary:
     """Words of one kind of descriptor.
 
     Attributes:
-        descriptor: kind of the words.
-        tree: the words, and the search tree over them.
-        statistics: how often words occur, alone and together.
         samples: the words, (n,) int32, of some training images, which represent new places.
         beam: branches followed at a time when searching a descriptor's word. Two find the nearest
             word clearly more often than one (`lab/reports/constants.md`).
@@ -340,10 +330,6 @@ class Vocabulary:
 
         Args:
             descriptors: (N, B) uint8, possibly none.
-            kind: kind of the descriptors.
-
-        Raises:
-            IncompatibleError: the vocabulary has another kind.
         """
         if kind != self.descriptor:
             raise IncompatibleError(
@@ -394,8 +380,6 @@ def hash_of(vocabulary: Vocabulary) -> bytes:
 
 
 class _About(msgspec.Struct):
-    """Metadata of a vocabulary, in addition to its arrays."""
-
     format: int
     descriptor: str
     images: Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
@@ -416,11 +400,7 @@ _MALFORMED = (
 
 
 def decode_vocabulary(body: bytes) -> Vocabulary:
-    """Inverse of `encode_vocabulary`, for bytes of any origin.
-
-    Raises:
-        MapCorruptError: they are not a vocabulary of a known format, or hold invalid values.
-    """
+    """Inverse of `encode_vocabulary`, for bytes of any origin."""
     try:
         tensors = safetensors.deserialize(body)  # type: ignore[no-untyped-call]  # as it comes
         about = _metadata(body)
@@ -436,9 +416,6 @@ def default_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
 
     For the kinds of this package a small one, trained on simulated drives; for others
     `one_word_vocabulary`.
-
-    Raises:
-        IncompatibleError: the kind is unknown.
     """
     file = resources.files("engram.places") / "data" / f"{plain_name(descriptor)}.safetensors"
     if file.is_file():
@@ -447,11 +424,7 @@ def default_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
 
 
 def one_word_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
-    """A vocabulary by which all places look alike.
-
-    Raises:
-        IncompatibleError: the kind is unknown.
-    """
+    """A vocabulary by which all places look alike."""
     root_and_word = np.zeros((2, feature_kind(descriptor).descriptor_bytes), np.uint8)
     tree = TreeArrays(root_and_word, np.array([1, 2, 2], np.int32))
     one, none = np.ones(1, np.int32), np.zeros(1, np.int32)
@@ -546,14 +519,11 @@ class TrainingConfig:
     """Settings of `train_vocabulary`.
 
     Attributes:
-        words: number of words.
         depth: levels of the tree. Three find the nearest word more often than four, and as fast.
-        beam: see `Vocabulary`.
         iterations: most iterations per cluster; more have no measurable effect.
         descriptors: most descriptors to cluster, drawn evenly from all frames.
         samples: frames that represent new places. Source: Cummins & Newman, IJRR 2008, §4.5:
             sampling estimates the sum over unmapped places.
-        seed: seed of all random draws.
     """
 
     words: Annotated[int, Meta(ge=2, le=65_536)] = 10_000
@@ -583,13 +553,8 @@ def train_vocabulary(
     Args:
         frames: the descriptors of each frame, (N, B) uint8. The frames should show distinct
             places, like a random sample of where robots drive, as words are counted per frame.
-        kind: kind of the descriptors.
-        config: settings.
         trained_on: description stored in the vocabulary, for people.
         monitor: receives the stages `cluster`, `quantise` and `relate`.
-
-    Raises:
-        InputError: fewer descriptors than words.
     """
     config = config or TrainingConfig()
     total = sum(len(frame) for frame in frames)

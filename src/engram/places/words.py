@@ -28,25 +28,12 @@ _BATCH = 1000
 
 
 def vocabulary_of(opened: Map) -> Vocabulary | None:
-    """The vocabulary stored in a map; None without one. For `Map.derived`.
-
-    Raises:
-        MapCorruptError: it is damaged.
-    """
+    """The vocabulary stored in a map; None without one. For `Map.derived`."""
     return None if opened.vocabulary is None else decode_vocabulary(opened.vocabulary)
 
 
 def problems_of(path: Path, *, thin: bool = False) -> list[Problem]:
-    """Faults of a map file, its vocabulary included.
-
-    Args:
-        path: NAME.engram.
-        thin: see `check_file`.
-
-    Raises:
-        NotAMapError: the file does not exist or is not a map.
-        FormatVersionError: a newer Engram wrote it.
-    """
+    """Faults of a map file, its vocabulary included."""
     return [*check_file(path, thin=thin).problems, *vocabulary_problems(path)]
 
 
@@ -84,7 +71,6 @@ class NodeWords:
     Words stored in the map are read from it; others are computed from landmarks, once.
 
     Args:
-        frames: landmarks of the nodes.
         vocabulary: gives the vocabulary; called once, at first use.
         store: the map that stores words; None for none.
     """
@@ -135,11 +121,7 @@ class NodeWords:
         _ = self.idf, self.kept
 
     def of_frame(self, frame: Frame) -> Words:
-        """The words (n,) int32 of a frame.
-
-        Raises:
-            IncompatibleError: its descriptors are of another kind than the vocabulary's.
-        """
+        """The words (n,) int32 of a frame."""
         last = self._last
         if last is None or last[0] is not frame:
             words = self.vocabulary.words_of(frame.landmarks.descriptors, frame.descriptor)
@@ -150,9 +132,6 @@ class NodeWords:
         """The words (n,) int32 of a node; None if its landmarks are damaged.
 
         ``engram check`` reports such a node, and reading its landmarks raises.
-
-        Raises:
-            IncompatibleError: as `of_frame`.
         """
         words = self.kept.get(node)
         if words is None and node not in self._worked_out:
@@ -165,15 +144,10 @@ class NodeWords:
         Damaged nodes are left out. If stopped early, the progress is kept.
 
         Args:
-            nodes: nodes of the map, which is open for writing.
             monitor: receives the stage `words`, one item per node.
 
         Returns:
             Number of nodes whose words were computed.
-
-        Raises:
-            IncompatibleError: the nodes have another kind of descriptor.
-            StorageFullError: the disk is full; the progress is kept.
         """
         assert self._store is not None
         missing = [node for node in nodes if node not in self.kept]
@@ -218,11 +192,6 @@ class PlaceBook:
 
     Only the thread of the graph calls `learn_new_nodes`; any thread may compare.
 
-    Args:
-        graph: the experience graph; may grow.
-        words: the words of its nodes, and their frames.
-        recogniser: makes the recogniser for a vocabulary.
-
     Attributes:
         unreadable: nodes, by dense index, with damaged landmarks: they have no words here, and
             must not be proposed.
@@ -246,11 +215,7 @@ class PlaceBook:
         return len(self._recogniser)
 
     def words_of(self, frame: Frame) -> Words:
-        """What the recogniser compares of a frame, (n,) int32: its words, or its signature.
-
-        Raises:
-            IncompatibleError: it has another kind of descriptor.
-        """
+        """What the recogniser compares of a frame, (n,) int32: its words, or its signature."""
         if isinstance(self._recogniser, ReadsFrames):
             return self._recogniser.signature(frame)
         return self._words.of_frame(frame)

@@ -42,7 +42,6 @@ class Surroundings:
     """Walks along the measured edges of a graph: those that a camera or odometry measured.
 
     Args:
-        graph: the graph.
         usable: (E,) bool, edges that may be walked along, in the order of `graph.edges`.
     """
 
@@ -110,11 +109,7 @@ def is_measured(kind: EdgeKind) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class RepairConfig:
-    """Settings of `find_wrong_edges`.
-
-    Raises:
-        ConfigError: a value is out of its bounds.
-    """
+    """Settings of `find_wrong_edges`."""
 
     adjust: AdjustConfig = field(default_factory=AdjustConfig)
     gross_m: Annotated[
@@ -243,8 +238,6 @@ def suspect(graph: ExperienceGraph, config: RepairConfig, gone: Collection[int] 
     """Adjusts the whole map robustly, and reports the edges it contradicts or does not confirm.
 
     Args:
-        graph: the graph.
-        config: settings.
         gone: indices of edges that are left out.
     """
     edges = graph.edges
@@ -323,7 +316,6 @@ class Crossings:
 
         Args:
             side_a, side_b: nodes near one end of an edge, and near the other.
-            count: number of nodes of the graph.
             pause: entries of a path from its last on one side to its first on the other, at most.
 
         Returns:
@@ -377,14 +369,7 @@ class Look:
 
 
 class SecondLooks:
-    """Matches the nodes around the ends of edges.
-
-    Args:
-        graph: the graph.
-        frames: the landmarks of its nodes.
-        surroundings: the ways that lead to the nodes around.
-        config: which pairs are looked at.
-    """
+    """Matches the nodes around the ends of edges."""
 
     def __init__(
         self,
@@ -471,15 +456,12 @@ class Finding:
     """An edge that is probably wrong, with the evidence.
 
     Attributes:
-        edge: the edge.
         row: its index in the graph's edges.
         why: `contradicted` by the rest of the map, `alone`: nothing confirms it, or `derived`
             from edges that are.
         off_m, off_rad: disagreement with the rest of the map; 0 where nothing else constrains it.
-        chi2: the same, squared and normalised.
         sigma_m: the standard deviation that the edge claims, metres.
         confirming, looks: pairs of nodes around it that match as it says, of those tried.
-        inliers: of a match of its own ends.
         witnessed: fixes of the best drive that crossed it, on the weaker side.
         surety: how surely it is wrong; 1 and more is certain enough to remove it.
     """
@@ -537,7 +519,6 @@ class Findings:
         wrong: edges to remove, the surest first.
         doubtful: edges that something speaks against, and too little.
         examined: edges that were looked at once more, of all.
-        of_edges: number of edges of the map.
     """
 
     wrong: tuple[Finding, ...]
@@ -559,13 +540,6 @@ def find_wrong_edges(
     confirmed by a short second path between their ends. What neither contradicts nor confirms, such
     as the only link between two components, is looked at again: nodes around both ends are matched,
     and drives that crossed it are counted.
-
-    Args:
-        graph: the graph of the map.
-        paths: its path memory.
-        frames: the landmarks of its nodes.
-        config: settings.
-        monitor: receives progress, and may stop the search.
     """
     config = config or RepairConfig()
     crossings = Crossings.of(graph, paths)
@@ -600,7 +574,6 @@ class _Search:
         self._trusted = Surroundings(graph, trusted)
 
     def findings(self, monitor: Monitor) -> list[Finding]:
-        """The suspected edges, judged."""
         suspicion = self._suspicion
         monitor.check()
         odometry = np.array(

@@ -31,16 +31,7 @@ _HEIGHT_PX = 360
 
 
 def write_pictures(frames: FrameReader, found: Findings, folder: Path) -> int:
-    """Writes one picture of each edge whose nodes have thumbnails; returns their number.
-
-    Args:
-        frames: of the map.
-        found: the edges; files are numbered in their order.
-        folder: created if missing.
-
-    Raises:
-        InputError: the folder or a picture cannot be written.
-    """
+    """Writes one picture of each edge whose nodes have thumbnails; returns their number."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -97,11 +88,9 @@ class GeometryReport:
     """What ``engram check --geometry`` found, and did.
 
     Attributes:
-        findings: the edges.
         components: number of components without the wrong edges, and with them.
         revision: of the repair; None for a preview.
         moved: what the repair moved in the map frame; None for a preview.
-        pictures: number of pictures written.
     """
 
     findings: Findings
@@ -157,17 +146,10 @@ def check_geometry(
     """Looks for wrong edges, and removes them on request.
 
     Args:
-        path: the map.
-        config: settings.
         placing: how nodes that the wrong edges had misplaced are laid out again.
         author: commits a revision of this author in which the wrong edges no longer count; None
             changes nothing.
         pictures: folder for a picture of both sides of each edge; None for none.
-        monitor: receives progress, and may stop the search.
-
-    Raises:
-        MapError: the map cannot be read, or written.
-        InputError: the pictures cannot be written.
     """
     config = config or RepairConfig()
     with Map.open(path) as store:
@@ -212,7 +194,6 @@ def remove_edges(
 
 
 def _components(store: Map, found: Findings) -> tuple[int, int]:
-    """Number of components without the wrong edges, and with them."""
     graph = store.graph
     kept = np.ones(len(graph.edges), np.bool_)
     kept[[one.row for one in found.wrong]] = False

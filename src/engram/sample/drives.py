@@ -44,17 +44,7 @@ DRIVES = (
 
 
 def write_drives(folder: Path, monitor: Monitor = QUIET) -> None:
-    """Writes the drives into a folder, each as a whole or not at all; those that are there stay.
-
-    Args:
-        folder: created if missing.
-        monitor: receives the progress, file by file.
-
-    Raises:
-        InputError: something else has a drive's name, or the folder cannot be written to.
-        StorageFullError: no space is left.
-        MapError: as for `engram.files.draft_folder`.
-    """
+    """Writes the drives into a folder, each as a whole or not at all; those that are there stay."""
     shipped = {one.name: sorted(_files(_DATA / one.name)) for one in DRIVES}
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -70,7 +60,6 @@ def write_drives(folder: Path, monitor: Monitor = QUIET) -> None:
 
 
 def _write(target: Path, files: list[Path], monitor: Monitor) -> None:
-    """Writes one drive, or looks whether it is there."""
     source = _DATA / target.name
     if target.exists():
         if not all(_equal(source / one, target / one) for one in files):
@@ -110,9 +99,6 @@ def offsets_m(map_path: Path, folder: Path) -> NDArray[np.float64]:
 
     Returns:
         (K,) float64: distance of each fix's ``node_from_live`` from the truth, metres.
-
-    Raises:
-        EngramError: the drive, its truth or the map cannot be read.
     """
     world_from_cam = {
         int(stamp_ns): pose

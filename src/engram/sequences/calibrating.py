@@ -37,13 +37,8 @@ def cameras_of(
     """The calibration that the caller gave, or else the drive's own.
 
     Args:
-        options: how the drive is opened.
         own: reads the drive's own calibration.
         folder: of the left images, for calibrations that state no image size.
-        rectified: whether the images are rectified.
-
-    Raises:
-        CalibrationError: it cannot be used.
     """
     if options.calibration is None:
         return own()
@@ -57,17 +52,7 @@ def cameras_given(
     rectified: bool = False,
     halves: bool = False,
 ) -> Cameras:
-    """The calibration that the caller gave; see `cameras_of`.
-
-    Args:
-        options: how the drive is opened.
-        folder: of the left images.
-        rectified: whether the images are rectified.
-        halves: whether each image holds both sides.
-
-    Raises:
-        CalibrationError: it cannot be used.
-    """
+    """The calibration that the caller gave; see `cameras_of`."""
     assert options.calibration is not None
     return read_calibration(
         options.calibration,
@@ -88,13 +73,9 @@ def read_mask(path: Path, cameras: Cameras) -> NDArray[np.bool_]:
     Args:
         path: an image of the size of the drive's own images: white is used, black is left out,
             such as the robot's own body.
-        cameras: of the drive.
 
     Returns:
         (height, width) bool, False where nothing is used.
-
-    Raises:
-        ConfigError: the image cannot be read, has another size, or is black throughout.
     """
     camera = cameras.camera
     try:
@@ -134,12 +115,7 @@ def check_sides(cameras: Cameras, pairs: Iterable[StereoPair], where: object) ->
     Nothing is looked at unless the calibration's sign raises the doubt.
 
     Args:
-        cameras: of the drive.
         pairs: some of its rectified pairs; read until they decide.
-        where: the drive, for messages.
-
-    Raises:
-        CalibrationError: near things lie further right in the right images, or no image decides.
     """
     if not cameras.sides_doubtful:
         return
@@ -168,7 +144,6 @@ def mask_image(seen: NDArray[np.bool_], cameras: Cameras) -> NDArray[np.uint8]:
 
     Args:
         seen: (height, width) bool of the rectified left image.
-        cameras: of the drive.
 
     Returns:
         (h, w) uint8 of the size of the drive's own images: 255 is used, 0 is left out.
@@ -186,11 +161,7 @@ def mask_image(seen: NDArray[np.bool_], cameras: Cameras) -> NDArray[np.uint8]:
 
 
 def check_no_view(options: OpenOptions, cameras: Cameras) -> None:
-    """Refuses a chosen field of view for images that come rectified.
-
-    Raises:
-        CalibrationError: they do.
-    """
+    """Refuses a chosen field of view for images that come rectified."""
     if options.field_of_view_deg is not None and cameras.rectification is None:
         raise CalibrationError(
             "the images are rectified already: --field-of-view is for raw images "

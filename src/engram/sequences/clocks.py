@@ -66,7 +66,6 @@ class ClockStep:
         number: of the first item after it, from 0.
         by_ns: what was added to the clock, about, ns; or, set forwards, perhaps a pause.
         shift_ns: time minus stamp from there on, ns.
-        time_ns: time of that item.
     """
 
     number: int
@@ -86,10 +85,8 @@ class StampReport:
     """What happened to the stamps of a stream.
 
     Attributes:
-        count: stamps.
         repeated, early, ahead: those left out, by their fault.
         example: the first of them, for people; "" without one.
-        steps: where the clock was set.
     """
 
     count: int = 0
@@ -152,10 +149,7 @@ class Timed(Generic[T]):
     """An item of a stream with its time.
 
     Attributes:
-        item: the item.
         number: its place in the stream, from 0.
-        stamp_ns: its stamp.
-        time_ns: its time, which rises from item to item.
         step: where the clock was set just before it; None elsewhere.
     """
 
@@ -179,8 +173,6 @@ class Placed:
 
     Attributes:
         number: its place in the stream, from 0.
-        stamp_ns: the stamp.
-        time_ns: its time.
         step: where the clock was set just before it; None elsewhere.
     """
 
@@ -196,9 +188,6 @@ class SteadyClock:
     Args:
         waits: whether the caller waits for stamps that come later, as a reader of files does.
         left_out: called with the number and the fault of each stamp that is left out.
-
-    Attributes:
-        steps: where the clock was set, so far.
     """
 
     def __init__(
@@ -263,7 +252,6 @@ class SteadyClock:
         """Takes the next stamp.
 
         Args:
-            stamp_ns: the stamp.
             received_ns: when a recorder received it, by a clock of its own; None if unknown.
             trusted: whether a reader has looked after it: it is right if it rises.
 
@@ -374,7 +362,6 @@ class SteadyClock:
         return _rises(before, stamp) and jumped_ns > _USUAL_RATIO * _per_item_ns(before, stamp)
 
     def _stepped(self, chain: list[_Stamp]) -> list[Placed]:
-        """Begins a new stretch."""
         last, first = self._last, chain[0]
         assert last is not None
         begun = [_per_item_ns(a, b) for a, b in pairwise(chain)]
@@ -461,7 +448,6 @@ def in_time(
     """The items of a stream that have a time, with it; a dozen of them wait at most.
 
     Args:
-        items: the stream.
         stamp_of: the stamp of an item, ns.
         clock: a clock that waits; it has the report afterwards.
         received_of: when a recorder received an item, ns; None if unknown.
@@ -499,7 +485,6 @@ def _follows(a: _Stamp, b: _Stamp, usual_ns: float, far_ns: int = _FAR_NS) -> bo
 
 
 def _alike(a: _Stamp, b: _Stamp, usual_ns: float) -> bool:
-    """Whether the interval between the two is about the usual one."""
     return usual_ns <= _USUAL_RATIO * _per_item_ns(a, b) <= _USUAL_RATIO**2 * usual_ns
 
 
@@ -513,8 +498,6 @@ def _longest(
     Of chains of a length, that of the stamps that came first.
 
     Args:
-        stamps: in the order in which they came.
-        linked: whether two of them may follow each other.
         first: with what the chain begins; None for any.
 
     Returns:

@@ -46,11 +46,6 @@ def read_image(
     """Decode an image as (height, width) uint8 grey, C-contiguous.
 
     16-bit images are scaled from their full range (65,535 → 255); transparency is dropped.
-
-    Raises:
-        SequenceError: the file is missing, cut short, not an image of a known type, or its size is
-            not `width` × `height`.
-        ConfigError: one colour channel is requested and the image is grey.
     """
     return grey(path, decoded(path, _read_bytes(path), (width, height)), channel)
 
@@ -61,12 +56,7 @@ def decoded(
     """(h, w) or (h, w, 3 or 4) pixels of an encoded image: grey, BGR or BGRA; uint8 or uint16.
 
     Args:
-        where: file or message, for messages.
-        content: its bytes.
         size: required width and height, px; None for any.
-
-    Raises:
-        SequenceError: it is cut short, of an unknown type, or of another size.
     """
     _check_size(where, _claimed(where, content), size)
     if content.startswith(b"\xff\xd8") and not _jpeg_is_whole(content):
@@ -80,32 +70,19 @@ def decoded(
 def grey(
     where: object, image: NDArray[np.generic], channel: Channel = Channel.GREY
 ) -> NDArray[np.uint8]:
-    """The (h, w) uint8 grey of a (h, w[, 1, 3, 4]) image of 8 or 16 bit, in OpenCV's BGR order.
-
-    Raises:
-        SequenceError: its pixels are of another kind.
-        ConfigError: one colour channel is requested and the image is grey.
-    """
+    """The (h, w) uint8 grey of a (h, w[, 1, 3, 4]) image of 8 or 16 bit, in OpenCV's BGR order."""
     return _one_channel(where, _eight_bit(where, image), channel)
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, px, by its header.
-
-    Raises:
-        SequenceError: the file is missing or not an image.
-    """
+    """Width and height of an image file, px, by its header."""
     size = _claimed(path, _read_bytes(path))
     check_not_huge(path, size)
     return size
 
 
 def image_bits(path: Path) -> int | None:
-    """Bits of the brightest pixel of a 16-bit image; None for one of 8 bits.
-
-    Raises:
-        SequenceError: the file is missing or not an image.
-    """
+    """Bits of the brightest pixel of a 16-bit image; None for one of 8 bits."""
     content = _read_bytes(path)
     check_not_huge(path, _claimed(path, content))
     image = _decoded(path, content)
@@ -165,11 +142,7 @@ def _check_size(path: object, size: tuple[int, int], wanted: tuple[int, int] | N
 
 
 def check_not_huge(path: object, size: tuple[int, int]) -> None:
-    """Refuses an image that claims more pixels than any stereo camera delivers.
-
-    Raises:
-        SequenceError: it does.
-    """
+    """Refuses an image that claims more pixels than any stereo camera delivers."""
     if size[0] * size[1] > _MAX_PIXELS:
         raise SequenceError(
             f"{path}: claims {size[0]}×{size[1]} px, more than {_MAX_PIXELS:,}: not decoded"

@@ -89,10 +89,6 @@ class ImageDrive:
     """The content of a layout, before the caller's options.
 
     Attributes:
-        path: folder of the drive.
-        info: facts from its files.
-        cameras: the stereo pair.
-        places: all its pairs and faults, in the order of time.
         read: decodes one image: path, width, height, channel → (height, width) uint8 grey.
     """
 
@@ -104,19 +100,7 @@ class ImageDrive:
 
 
 class ImageSequence:
-    """A `StereoSequence` over image files. Pairs are decoded on demand.
-
-    Attributes:
-        info: what is known of the drive as a whole.
-        cameras: its stereo pair, with the rectification of raw images.
-        camera: its one camera, rectified.
-        frames: the used frames of the drive.
-        stamps: what happened to the stamps of the whole drive.
-
-    Raises:
-        SequenceError: a chosen pair is bad and `skip_bad` is not set, or none is left.
-        ConfigError: a start time is given for a drive whose clock is UTC already.
-    """
+    """A `StereoSequence` over image files. Pairs are decoded on demand."""
 
     def __init__(self, drive: ImageDrive, options: OpenOptions) -> None:
         self.info = with_options(drive.info, options)
@@ -147,11 +131,7 @@ class ImageSequence:
         return self.cameras.rectification
 
     def motion(self) -> MotionSource | None:
-        """A new pass through the motion of the caller's files; None without one.
-
-        Raises:
-            SequenceError: a file cannot be used.
-        """
+        """A new pass through the motion of the caller's files; None without one."""
         mounting = self.camera.cam_from_rig
         return motion_of_files(self._options.motion, mounting, self._shift_ns)
 
@@ -180,21 +160,12 @@ class ImageSequence:
         return len(self._pairs)
 
     def __iter__(self) -> Iterator[StereoPair]:
-        """Decodes one pair at a time.
-
-        Raises:
-            SequenceError: an image is missing, unreadable or of the wrong size, and `skip_bad`
-                is not set.
-        """
+        """Decodes one pair at a time."""
         self._reading_faults.clear()
         return self.usable(range(len(self._pairs)))
 
     def usable(self, indices: Iterable[int]) -> Iterator[StereoPair]:
-        """Decodes some pairs, as iterating decodes all.
-
-        Raises:
-            SequenceError: as for iterating.
-        """
+        """Decodes some pairs, as iterating decodes all."""
         for index in indices:
             try:
                 pair = self.read(index)
@@ -227,11 +198,7 @@ class ImageSequence:
         return max(found, default=None)
 
     def read(self, index: int) -> StereoPair:
-        """Decode pair `index` of `len(self)`, whatever `skip_bad` says.
-
-        Raises:
-            SequenceError: as for iterating.
-        """
+        """Decode pair `index` of `len(self)`, whatever `skip_bad` says."""
         files = self._pairs[index]
         rectification = self.cameras.rectification
         left, right = self._load(files)
@@ -289,11 +256,7 @@ def rectified(image: NDArray[np.uint8], table: RemapTable) -> NDArray[np.uint8]:
 
 
 def with_options(info: SequenceInfo, options: OpenOptions) -> SequenceInfo:
-    """Facts of a drive, completed by the caller's options.
-
-    Raises:
-        ConfigError: a start time is given for a drive whose clock is UTC already.
-    """
+    """Facts of a drive, completed by the caller's options."""
     clock = info.clock
     if options.recorded_at_ns is not None:
         if clock is Clock.UTC:
@@ -355,12 +318,7 @@ def is_kitti_raw(path: Path) -> bool:
 
 
 def find_kitti_odometry(path: Path, options: OpenOptions) -> ImageDrive:
-    """A sequence of the odometry benchmark: relative clock, `calib.txt`, `times.txt`.
-
-    Raises:
-        SequenceError: images or stamps are missing or malformed.
-        CalibrationError: the projections of the rig are missing, malformed or not a pair.
-    """
+    """A sequence of the odometry benchmark: relative clock, `calib.txt`, `times.txt`."""
     left, right = _CAMERAS[options.rig]
     folders = _rig_folders(path, {camera: f"image_{camera}" for camera in range(4)}, options.rig)
     times = path / "times.txt"
@@ -382,12 +340,7 @@ def find_kitti_odometry(path: Path, options: OpenOptions) -> ImageDrive:
 
 
 def find_kitti_raw(path: Path, options: OpenOptions) -> ImageDrive:
-    """A synced and rectified drive of the raw data: UTC stamps, `calib_cam_to_cam.txt`.
-
-    Raises:
-        SequenceError: images or stamps are missing or malformed.
-        CalibrationError: the projections of the rig are missing, malformed or not a pair.
-    """
+    """A synced and rectified drive of the raw data: UTC stamps, `calib_cam_to_cam.txt`."""
     left, right = _CAMERAS[options.rig]
     names = {camera: f"image_{camera:02d}/data" for camera in range(4)}
     folders = _rig_folders(path, names, options.rig)
@@ -434,7 +387,6 @@ class _Calibration:
         return values
 
     def stereo_camera(self, left: str, right: str, size: tuple[int, int]) -> StereoCamera:
-        """The rectified pair of two projections (3×4); its rig frame is rectified camera 0's."""
         projections = [self.numbers(name, 12).reshape(3, 4) for name in (left, right)]
         difference = np.abs(projections[0][:, :3] - projections[1][:, :3]).max()
         if not difference <= _SAME_INTRINSICS_PX:
@@ -553,13 +505,7 @@ def tumvi_calibration(path: Path) -> Path:
 
 
 def find_euroc(path: Path, options: OpenOptions) -> ImageDrive:
-    """A drive in ASL layout, `cam0` left and `cam1` right, with its rectification.
-
-    Raises:
-        SequenceError: images or stamps are missing or malformed.
-        CalibrationError: a `sensor.yaml` is missing or malformed, or the two cameras are not a
-            stereo pair.
-    """
+    """A drive in ASL layout, `cam0` left and `cam1` right, with its rectification."""
     left, right = (_mav_folder(path) / name / "sensor.yaml" for name in ("cam0", "cam1"))
     view = options.field_of_view_deg
     return _find(path, options, "euroc", lambda: sensor_cameras(left, right, view))
@@ -570,10 +516,6 @@ def find_tumvi(path: Path, options: OpenOptions) -> ImageDrive:
 
     Source: Schubert et al., "The TUM VI Benchmark for Evaluating Visual-Inertial Odometry", IROS
     2018, and the data set's page: 16-bit images of 512 or 1024 px, `dso/camchain.yaml`.
-
-    Raises:
-        SequenceError: images or stamps are missing or malformed.
-        CalibrationError: `camchain.yaml` is malformed.
     """
     file = tumvi_calibration(path)
     view = options.field_of_view_deg
@@ -598,11 +540,7 @@ def _find(
 
 
 def sensor_cameras(left: Path, right: Path, field_of_view_deg: float | None = None) -> Cameras:
-    """The stereo pair of two `sensor.yaml`.
-
-    Raises:
-        CalibrationError: one is missing or malformed, or the two cameras are not a stereo pair.
-    """
+    """The stereo pair of two `sensor.yaml`."""
     left_camera, body_from_left = _read_sensor(left)
     right_camera, body_from_right = _read_sensor(right)
     calibration = RawStereoCalibration(
@@ -649,7 +587,6 @@ def _stamped_files(side: Path) -> Iterator[StampedFile | str]:
 
 
 def _read_sensor(path: Path) -> tuple[RawCamera, SE3]:
-    """Camera and body_from_camera of a `sensor.yaml`."""
     text = read_text(path, CalibrationError)
     try:
         entries = read_yaml(text)
@@ -713,12 +650,7 @@ def _both(path: Path) -> Path | None:
 
 
 def find_folder(path: Path, options: OpenOptions) -> ImageDrive:
-    """A plain folder. With `times.txt`, images pair by name; without it, names are stamps in ns.
-
-    Raises:
-        SequenceError: images or stamps are missing or malformed.
-        CalibrationError: `calibration.toml` is missing or malformed, or not of a stereo pair.
-    """
+    """A plain folder. With `times.txt`, images pair by name; without it, names are stamps in ns."""
     file = path / "calibration.toml"
     if options.calibration is None and not file.exists():
         raise CalibrationError(
@@ -767,11 +699,7 @@ def _places(path: Path, options: OpenOptions) -> Listing:
 
 
 def _named_alike(left: Path, right: Path) -> list[dict[str, Path]]:
-    """The images of both sides by name, without the words for the sides.
-
-    Raises:
-        SequenceError: no image has a partner.
-    """
+    """The images of both sides by name, without the words for the sides."""
     sides = [{file.stem: file for file in image_files(folder)} for folder in (left, right)]
     if sides[0].keys() & sides[1].keys():
         return sides
@@ -842,12 +770,7 @@ def is_robotcar(path: Path) -> bool:
 
 
 def find_robotcar(path: Path, options: OpenOptions) -> ImageDrive:
-    """A traversal; its models lie in `models/`, there or one or two folders up.
-
-    Raises:
-        SequenceError: images or stamps are missing or malformed.
-        CalibrationError: the models are missing or malformed.
-    """
+    """A traversal; its models lie in `models/`, there or one or two folders up."""
     sides = [path / "stereo" / side for side in ("left", "right")]
     cameras = cameras_of(options, lambda: _cameras(path, sides[0]), sides[0])
     left, right = (_stamped(side) for side in sides)

@@ -40,7 +40,6 @@ def paired(
     step do. These are closer than half an interval.
 
     Args:
-        left, right: the items of each side, by rising time.
         tolerance_ns: largest difference of stamps within a pair, ns.
     """
     pairing = _Pairing(tolerance_ns)
@@ -78,7 +77,6 @@ class _Pairing:
         self._intervals_ns: deque[int] = deque(maxlen=_NEWEST_INTERVALS)
 
     def next_left(self, item: Timed[L]) -> None:
-        """Counts the next left item."""
         self._loose = self._loose or item.step is not None
         if self._last_ns is not None:
             self._intervals_ns.append(item.time_ns - self._last_ns)
@@ -94,7 +92,6 @@ class _Pairing:
         return left.time_ns - right.time_ns - self._lag_ns > self._slack_ns
 
     def matches(self, left: Timed[L], right: Timed[R]) -> bool:
-        """Whether the two are of one instant."""
         if abs(left.stamp_ns - right.stamp_ns) <= self._tolerance_ns:
             return True
         set_apart = left.time_ns - left.stamp_ns != right.time_ns - right.stamp_ns
@@ -102,12 +99,10 @@ class _Pairing:
         return (set_apart or self._loose) and off_ns <= self._slack_ns
 
     def is_nearer(self, left: Timed[L], right: Timed[R], found: Timed[R]) -> bool:
-        """Whether a right item fits better than the one found."""
         off_ns, other_ns = (abs(left.stamp_ns - one.stamp_ns) for one in (right, found))
         return off_ns <= self._tolerance_ns and off_ns < other_ns
 
     def learn(self, left: Timed[L], right: Timed[R]) -> None:
-        """Takes in a pair."""
         if self._loose or left.stamp_ns != left.time_ns or right.stamp_ns != right.time_ns:
             self._lag_ns = left.time_ns - right.time_ns
         self._loose, self._known = False, True
@@ -137,7 +132,6 @@ class PairFiles:
     Attributes:
         stamp_ns: their time by the rule of `engram.sequences.clocks`: the stamp of the left one,
             unless the clock was set back before.
-        left, right: the files.
         step: where the clock was set just before the pair; None elsewhere.
     """
 
@@ -161,11 +155,7 @@ class StampedFile:
 
 
 class WrongStamp(str):
-    """The fault of a place that is left out for its stamp, whatever `--skip-bad` says.
-
-    Attributes:
-        fault: what is wrong with it.
-    """
+    """The fault of a place that is left out for its stamp, whatever `--skip-bad` says."""
 
     fault: StampFault
 
@@ -191,11 +181,7 @@ def stamp_report(places: Listing) -> StampReport:
 
 
 def read_stamps(path: Path, parse: Callable[[str], int | None]) -> list[int]:
-    """The stamps of a file with one stamp a line, ns. Empty lines at the end are ignored.
-
-    Raises:
-        SequenceError: as `read_text`; a line is not a stamp, or there is none.
-    """
+    """The stamps of a file with one stamp a line, ns. Empty lines at the end are ignored."""
     lines = read_text(path).rstrip().splitlines()
     stamps_ns: list[int] = []
     for number, line in enumerate(lines, start=1):
@@ -241,11 +227,7 @@ def _in_range(stamp_ns: int) -> int | None:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The image files of a folder by name; hidden files and other file types are skipped.
-
-    Raises:
-        SequenceError: the folder does not exist, cannot be read, or holds no image.
-    """
+    """The image files of a folder by name; hidden files and other file types are skipped."""
     try:
         entries = sorted(folder.iterdir())
     except FileNotFoundError:
@@ -265,11 +247,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def numbered_files(folder: Path) -> dict[int, Path]:
-    """The images of a folder whose names are frame numbers, such as `000017.png`.
-
-    Raises:
-        SequenceError: as `image_files`; a name is not a number; two images have the same number.
-    """
+    """The images of a folder whose names are frame numbers, such as `000017.png`."""
     numbered: dict[int, Path] = {}
     for path in image_files(folder):
         if not (path.stem.isascii() and path.stem.isdecimal() and len(path.stem) <= 18):
@@ -321,7 +299,6 @@ def pair_by_stamp(
 
     Args:
         left: the left images or their faults, in the order of their files.
-        right: the right images likewise.
         tolerance_ns: largest difference of stamps within a pair, ns.
         sources: the file or folder that gave the left and the right stamps, for messages.
     """
@@ -356,7 +333,6 @@ def pair_by_stamp(
 
 
 def _pair(left: Timed[StampedFile], right: Timed[StampedFile]) -> PairFiles | str:
-    """A pair, or why it cannot be used."""
     faults = [one.item.fault for one in (left, right) if one.item.fault]
     step = left.step or right.step
     return "; ".join(faults) or PairFiles(left.time_ns, left.item.path, right.item.path, step)
@@ -368,9 +344,6 @@ def usable_pairs(
     """The pairs of the chosen places, and the faults of the others.
 
     Pairs with a wrong stamp are left out in any case.
-
-    Raises:
-        SequenceError: a chosen place is bad and `skip_bad` is not set, or no pair is left.
     """
     chosen = choose(places)
     reasons = [place for place in chosen if isinstance(place, str)]
@@ -422,7 +395,6 @@ def _nearest_text(stamp_ns: int, others: Iterable[Timed[StampedFile] | str]) -> 
 def _timed(
     stamps_ns: Sequence[int], names: Sequence[str], source: Path
 ) -> list[Timed[int] | WrongStamp]:
-    """Each stamp with its time, or its fault."""
     found: list[Timed[int] | WrongStamp | None] = [None] * len(stamps_ns)
 
     def left_out(number: int, fault: StampFault) -> None:

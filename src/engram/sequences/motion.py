@@ -30,9 +30,6 @@ class Trajectory:
     Attributes:
         stamps_ns: (N,) int64, rising.
         world_from_cam: N poses of the camera in the world frame, metres.
-
-    Raises:
-        InputError: the two have different lengths, or the stamps do not rise.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -64,20 +61,12 @@ class Trajectory:
 
 
 def read_tum(path: str | Path) -> Trajectory:
-    """TUM format: lines `seconds x y z qx qy qz qw`; lines that begin with # are comments.
-
-    Raises:
-        SequenceError: a line is something else, or the stamps do not rise.
-    """
+    """TUM format: lines `seconds x y z qx qy qz qw`; lines that begin with # are comments."""
     return trajectory_of(path, read_poses(path))
 
 
 def read_poses(path: str | Path) -> list[tuple[int, SE3]]:
-    """Stamps, ns, and poses of a file in TUM format, in any order.
-
-    Raises:
-        SequenceError: a line is something else.
-    """
+    """Stamps, ns, and poses of a file in TUM format, in any order."""
 
     def stamped(fields: list[str]) -> tuple[int, SE3]:
         stamp_ns = known_stamp(seconds_as_ns(fields[0]))
@@ -88,16 +77,7 @@ def read_poses(path: str | Path) -> list[tuple[int, SE3]]:
 
 
 def write_tum(path: str | Path, trajectory: Trajectory, comments: Sequence[str] = ()) -> None:
-    """Writes TUM format with stamps to the nanosecond; replaces an existing file atomically.
-
-    Args:
-        path: the file.
-        trajectory: what to write.
-        comments: lines for the head of the file; evo skips them.
-
-    Raises:
-        SequenceError: the file cannot be written.
-    """
+    """Writes TUM format with stamps to the nanosecond; replaces an existing file atomically."""
     path = Path(path)
     lines = [f"# {line}" for comment in comments for line in comment.splitlines()]
     lines.append("# seconds x y z qx qy qz qw (world_from_cam, metres)")
@@ -120,12 +100,7 @@ def read_rows(
     """The parsed rows of a text file; comments and empty lines are skipped.
 
     Args:
-        path: the file.
-        row: parses the fields of a line.
         delimiter: between fields; None for white space.
-
-    Raises:
-        SequenceError: a line cannot be parsed.
     """
     found = []
     for number, line in enumerate(read_text(Path(path)).splitlines(), start=1):
@@ -138,11 +113,7 @@ def read_rows(
 
 
 def trajectory_of(path: str | Path, poses: Iterable[tuple[int, SE3]]) -> Trajectory:
-    """The trajectory of a file's stamps, ns, and ``world_from_cam``.
-
-    Raises:
-        SequenceError: the stamps do not rise.
-    """
+    """The trajectory of a file's stamps, ns, and ``world_from_cam``."""
     listed = list(poses)
     stamps_ns = np.array([stamp_ns for stamp_ns, _ in listed], dtype=np.int64)
     try:
@@ -183,7 +154,6 @@ class Sample:
     """A measurement, which holds from the one before until its stamp.
 
     Attributes:
-        stamp_ns: its stamp.
         velocity_m_s: (3,) of the rig in its own axes; None from a gyroscope.
         rates_rad_s: (3,) turn rates in the axes of rig or gyroscope.
     """
@@ -289,11 +259,7 @@ def motion_of_files(
 
     Args:
         names: at most one file of odometry and one of a gyroscope.
-        cam_from_rig: mounting of the camera, if known.
         shift_ns: what is added to the stamps, ns.
-
-    Raises:
-        SequenceError: a file cannot be read, or there are two of a kind.
     """
     if not names:
         return None
@@ -324,20 +290,12 @@ def stamp_facts_of_files(names: tuple[str, ...]) -> list[str]:
 
 
 def read_samples(path: Path) -> list[Sample]:
-    """The samples of a file.
-
-    Raises:
-        SequenceError: it is of no known kind, malformed, or empty.
-    """
+    """The samples of a file."""
     return timed_samples(path)[0]
 
 
 def timed_samples(path: Path) -> tuple[list[Sample], StampReport]:
-    """The samples of a file by rising time, and the report on their stamps.
-
-    Raises:
-        SequenceError: it is of no known kind, malformed, or empty, or most of its stamps are wrong.
-    """
+    """The samples of a file by rising time, and the report on their stamps."""
     clock = SteadyClock(waits=True)
     if path.suffix.lower() == ".csv":
         timed = in_time(_csv_samples(path), lambda one: one.stamp_ns, clock)

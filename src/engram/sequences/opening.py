@@ -84,8 +84,6 @@ class SequenceFormat:
         looks_like: what a path must hold, as text.
         recognises: whether a path has this layout; checks names only.
         open: opens it; `open_images` makes it for layouts of image files.
-        rigs: the rigs it can have.
-        has_topics: whether its images are named by topics.
     """
 
     looks_like: str
@@ -238,8 +236,6 @@ def open_with(path: Path, options: OpenOptions, name: str | None = None) -> Driv
     """Opens a drive by checked options; see `open_drive` for the errors.
 
     Args:
-        path: folder or file of the drive.
-        options: how it is opened.
         name: one of `layout_names()`; None recognises the layout by its files.
     """
     name = recognise(path) if name is None else name
@@ -260,12 +256,7 @@ def layout_names() -> list[str]:
 
 
 def layout_named(name: str) -> SequenceFormat:
-    """The layout of that name.
-
-    Raises:
-        ConfigError: the name is unknown; the message lists the known ones.
-        IncompatibleError: another package adds it, and it cannot be used.
-    """
+    """The layout of that name."""
     if name in SEQUENCES:
         return SEQUENCES[name]
     if name in _PLUGINS.names():
@@ -283,12 +274,7 @@ def _layouts() -> dict[str, SequenceFormat]:
 
 
 def recognise(path: Path) -> str:
-    """The name of the layout found at a path.
-
-    Raises:
-        SequenceError: there is nothing, no known layout, or more than one.
-        IncompatibleError: another package adds a layout, and it cannot be used.
-    """
+    """The name of the layout found at a path."""
     if path.suffix == ".engram":
         raise SequenceError(f"{path}: is the name of a map, not of a drive; the map is given first")
     check_there(path, SequenceError)
@@ -355,7 +341,6 @@ def drives_inside(path: Path) -> list[Path]:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Contents of a folder by name; none if it is a file or cannot be read."""
     try:
         return sorted(folder.iterdir())
     except OSError:

@@ -31,10 +31,6 @@ class SequenceInfo:
     """Facts of a drive known before its first image is decoded.
 
     Attributes:
-        name: short display name, from the path.
-        format: the layout's name, such as "kitti".
-        clock: meaning of the stamps.
-        robot: name of the robot, if the source gives one.
         longitude_deg, zone: where the drive was, if known (method §2.8).
     """
 
@@ -112,11 +108,7 @@ def first_pair_hash(pair: StereoPair) -> str:
 
 
 def check_name(robot: str) -> str:
-    """The name of a robot, as maps store it.
-
-    Raises:
-        InputError: it is empty, too long, or not Unicode text.
-    """
+    """The name of a robot, as maps store it."""
     try:
         if robot and robot.encode() and len(robot) <= LONGEST_NAME:
             return robot
@@ -134,13 +126,8 @@ def session_of(
     """The session of a drive; equal for equal frames.
 
     Args:
-        info: facts of the drive.
-        camera: its camera.
         start_ns: stamp of the first used pair, ns.
         first_pair_hash: `first_pair_hash` of that pair; a frame log has it as a property.
-
-    Raises:
-        InputError: the robot's name is invalid; see `check_name`.
     """
     robot = check_name(info.robot or UNNAMED_ROBOT)
     return Session(
@@ -194,9 +181,6 @@ class FrameRange:
         start: first frame, >= 0.
         stop: end, not included; None for all the rest.
         step: distance of successive frames, >= 1.
-
-    Raises:
-        ConfigError: a part is negative, the step is 0, or stop is not after start.
     """
 
     start: int = 0
@@ -217,9 +201,6 @@ class FrameRange:
         """Read START:STOP:STEP, the words of a Python slice; any part may be missing.
 
         A single number N means the one frame N.
-
-        Raises:
-            ConfigError: the text is not a range.
         """
         parts = [part.strip() for part in text.split(":")]
         if len(parts) > 3 or text.strip() == "":
@@ -255,9 +236,6 @@ class TimeRange:
     Attributes:
         start, stop: its ends, both included; seconds from the drive's first frame (float), or ns
             since 1970 (int); None for the drive's own ends.
-
-    Raises:
-        ConfigError: the range is empty.
     """
 
     start: float | int | None = None
@@ -270,11 +248,7 @@ class TimeRange:
 
     @staticmethod
     def parse(start: Moment | None, stop: Moment | None) -> TimeRange:
-        """Reads seconds such as 12.5, or times such as 2026-03-01T09:30:00Z (UTC).
-
-        Raises:
-            ConfigError: a text is neither.
-        """
+        """Reads seconds such as 12.5, or times such as 2026-03-01T09:30:00Z (UTC)."""
         return TimeRange(_moment("--from", start), _moment("--to", stop))
 
     @property
@@ -322,25 +296,16 @@ class OpenOptions:
     """How to open a drive.
 
     Attributes:
-        rig: which rig, if the layout has two.
-        channel: how colour images become grey.
-        frames: which frames are used.
         skip_bad: leave out bad pairs and count them, instead of failing.
         pair_tolerance_ns: largest difference of stamps within a pair, ns, for layouts that pair by
             stamp.
-        robot: name of the robot; None for that of the source.
         recorded_at_ns: time of the drive's first frame, ns since 1970 UTC, for a drive whose clock
             is not UTC.
         longitude_deg, zone: where the drive was; None for the source's value.
-        times: which stretch of the drive is used.
-        calibration: file of the stereo pair's calibration; None for the drive's own.
         field_of_view_deg: horizontal field of view of rectified images; None for the largest.
         mask: image that is black where the robot sees itself; None for none.
         left, right: topics of a bag's images; None finds them by their names.
         motion: topics or files of odometry and gyroscope.
-
-    Raises:
-        ConfigError: the longitude is outside ±180°, the zone is unknown, the tolerance negative.
     """
 
     rig: Rig = Rig.GREY
@@ -371,11 +336,7 @@ class OpenOptions:
 
 
 def parse_choice(kind: type[E], text: str) -> E:
-    """A `Rig` or `Channel` by name, in British or American spelling.
-
-    Raises:
-        ConfigError: there is no such name.
-    """
+    """A `Rig` or `Channel` by name, in British or American spelling."""
     try:
         return kind(_SPELLINGS.get(text, text))
     except ValueError:
@@ -390,11 +351,7 @@ def parse_time(name: str, given: str | datetime | int | None) -> int | None:
     A time without an offset is taken as UTC.
 
     Args:
-        name: the option or keyword, for the error.
         given: the time; None gives None.
-
-    Raises:
-        ConfigError: the text is not an ISO 8601 time, or the time lies before 1970.
     """
     if given is None:
         return None

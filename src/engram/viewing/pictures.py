@@ -32,11 +32,7 @@ from engram.untrusted import printable
 
 
 def matplotlib_for_files() -> ModuleType:
-    """Matplotlib without a window.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """Matplotlib without a window."""
     try:
         import matplotlib
         import matplotlib.figure
@@ -52,9 +48,6 @@ def subplots(count: int, *, width: float, height: float, rows: int = 1) -> tuple
     """A figure with `count` axes in `rows` rows, of which the last may be shorter.
 
     Width and height are those of the figure, in inches.
-
-    Raises:
-        MissingExtraError: Matplotlib is not installed.
     """
     matplotlib_for_files()
     from matplotlib import pyplot
@@ -70,11 +63,7 @@ def subplots(count: int, *, width: float, height: float, rows: int = 1) -> tuple
 
 
 def save(figure: Any, path: Path) -> None:
-    """Writes the figure and releases its memory.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Writes the figure and releases its memory."""
     from matplotlib import pyplot
 
     try:
@@ -111,7 +100,6 @@ def match_picture(
         node_pixels: (K, 2) float32, positions in the node's image as fractions of its width and
             height.
         live_pixels: (K, 2) float32, positions in the live image, px.
-        caption: text below the images.
 
     Returns:
         (H', W', 3) uint8 BGR.
@@ -172,12 +160,7 @@ class PictureWriter:
     """Writes a picture of the match, or of its absence, at regular intervals.
 
     Args:
-        folder: folder of the pictures; created if missing.
         every: frames from one picture to the next.
-        frames: the map's frames.
-
-    Raises:
-        InputError: the folder cannot be created.
     """
 
     def __init__(self, folder: Path, every: int, frames: FrameReader) -> None:
@@ -195,10 +178,6 @@ class PictureWriter:
 
         Args:
             seen: `Robot.last`.
-            found: its localisation.
-
-        Raises:
-            InputError: the picture cannot be written.
         """
         self._count += 1
         if self._count % self._every:
@@ -266,7 +245,6 @@ def fixed_picture(pair: StereoPair, seen: NDArray[np.bool_]) -> NDArray[np.uint8
     """The left image, (h, w, 3) uint8 BGR, red where it moves with the camera.
 
     Args:
-        pair: the images.
         seen: (h, w) bool, False where the image moves with the camera.
     """
     picture = cv2.cvtColor(pair.left, cv2.COLOR_GRAY2BGR)
@@ -330,7 +308,6 @@ class Track:
     """One line of the picture.
 
     Attributes:
-        label: label in the legend.
         points_m: (N, 2) float64, x and y in the map frame, metres.
         colour: Matplotlib colour; None for the next of a series.
     """
@@ -349,14 +326,7 @@ def draw_from_above(
     """Draws tracks from above into an image file.
 
     Args:
-        tracks: the lines.
-        path: image file.
-        title: title of the picture.
         marks: places with their names, x and y, metres.
-
-    Raises:
-        InputError: the file cannot be written.
-        MissingExtraError: Matplotlib is not installed.
     """
     draw_panels([(title, tracks)], path, marks)
 
@@ -370,12 +340,7 @@ def draw_panels(
 
     Args:
         panels: title and tracks of each; a label has the same colour in all of them.
-        path: image file.
         marks: places with their names in every panel, x and y, metres.
-
-    Raises:
-        InputError: the file cannot be written.
-        MissingExtraError: Matplotlib is not installed.
     """
     names = dict.fromkeys(_track_name(track) for _, tracks in panels for track in tracks)
     colours = {name: f"C{number % 10}" for number, name in enumerate(names)}
@@ -405,17 +370,11 @@ def _shown(text: str) -> str:
 
 
 def _track_name(track: Track) -> str:
-    """The label of a track without its count."""
     return track.label.split(" (")[0]
 
 
 def check_picture(path: Path) -> None:
-    """Checks before the work whether a picture can be written to a path.
-
-    Raises:
-        InputError: the folder does not exist or is not writable, or the file extension is unknown.
-        MissingExtraError: Matplotlib is not installed.
-    """
+    """Checks before the work whether a picture can be written to a path."""
     check_output(path)
     formats = matplotlib_for_files().figure.Figure().canvas.get_supported_filetypes()
     ending = path.suffix.removeprefix(".").lower()
@@ -467,18 +426,11 @@ def plot_map(path: Path, out: Path, by: str = "experience", at: int | str | None
     anchors hold them. Unconnected components stand side by side.
 
     Args:
-        path: NAME.engram.
-        out: image file.
         by: key of `COLOURS`.
         at: number or tag of the revision; None for the newest.
 
     Returns:
         Number of nodes drawn.
-
-    Raises:
-        MapError: the map cannot be read, or has no such revision.
-        InputError: the picture cannot be written.
-        MissingExtraError: Matplotlib is not installed.
     """
     check_picture(out)
     with Map.open(path, at=at) as opened:
@@ -508,16 +460,7 @@ def plot_map(path: Path, out: Path, by: str = "experience", at: int | str | None
 
 
 def draw_difference(map_path: Path, difference: MapDifference, path: Path) -> None:
-    """Draws the unchanged, added and removed parts between two revisions, in the map frame.
-
-    Args:
-        map_path: the map that was compared.
-        difference: of two of its revisions.
-        path: image file.
-
-    Raises:
-        MissingExtraError: Matplotlib is not installed.
-    """
+    """Draws the unchanged, added and removed parts between two revisions, in the map frame."""
     graph = difference.graph
     points = np.zeros((len(graph), 2))
     for revision in (difference.before, difference.after):  # a node that moved is where it is now

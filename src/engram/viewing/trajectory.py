@@ -55,8 +55,6 @@ def chain_trajectory(
 
 
 class _PlacedNodes:
-    """Poses of nodes in the trajectory's frame."""
-
     def __init__(self, graph: ExperienceGraph) -> None:
         self._graph = graph
         self._tree: ChainTree | None = None
@@ -80,11 +78,7 @@ class _PlacedNodes:
 
 
 def write_trajectory(path: Path, graph: ExperienceGraph, results: Sequence[Localisation]) -> None:
-    """Writes a localised drive in TUM format.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Writes a localised drive in TUM format."""
     placed = chain_trajectory(graph, results)
     stamps_ns = np.array([stamp_ns for stamp_ns, _ in placed], dtype=np.int64)
     write_tum(path, Trajectory(stamps_ns, [pose for _, pose in placed]), HEADER)

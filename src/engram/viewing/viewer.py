@@ -41,10 +41,6 @@ class Viewer:
 
     Args:
         save: write a recording here and open no window; None opens the viewer.
-
-    Raises:
-        MissingExtraError: Rerun is not installed.
-        InputError: the recording cannot be written.
     """
 
     def __init__(self, save: Path | None = None) -> None:
@@ -80,7 +76,6 @@ class Viewer:
         """Shows a map, in which the next frames are; the one before goes.
 
         Args:
-            opened: the map.
             graph: with what a robot saves; None for that of the map.
         """
         self._whereabouts = Whereabouts(opened.frame, opened.graph if graph is None else graph)
@@ -104,7 +99,6 @@ class Viewer:
 
         Args:
             seen: `Robot.last`.
-            found: its localisation.
         """
         stream, rr = self._stream, self._rr
         stream.set_time("stamp", timestamp=np.datetime64(found.stamp_ns, "ns"))
@@ -148,11 +142,7 @@ class Viewer:
 
 
 def viewer_for(view: Path | None) -> Viewer | nullcontext[None]:
-    """The viewer of an option ``--view``: a window, a recording, or none.
-
-    Raises:
-        InputError: it is neither "window" nor a file NAME.rrd; or as `Viewer`.
-    """
+    """The viewer of an option ``--view``: a window, a recording, or none."""
     return nullcontext() if view is None else viewer_on(view)
 
 

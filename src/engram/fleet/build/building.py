@@ -67,8 +67,6 @@ class Drive:
 
     Attributes:
         source: path or URL of its frame log or images.
-        session: its record in the map.
-        frames: number of frames.
     """
 
     source: str
@@ -82,15 +80,7 @@ class Drive:
 
 
 def look_at_drive(path: Path, source: str) -> Drive:
-    """Reads what grouping needs of a drive.
-
-    Args:
-        path: local path of the drive.
-        source: path or URL for the workers.
-
-    Raises:
-        SequenceError: it cannot be read.
-    """
+    """Reads what grouping needs of a drive."""
     sequence = open_drive(path)
     return Drive(source, session_of_drive(sequence), len(sequence))
 
@@ -105,14 +95,9 @@ def group_drives(
     """Groups of drives, each in chronological order; none is empty.
 
     Args:
-        drives: all of them, each once.
         grouping: key of `GROUPINGS`, or path of a file of groups (`read_groups`).
-        groups: number of groups; ignored if a file gives them.
         seed: of `random`.
         leave_out: sessions to leave out; if fewer drives than groups remain, each is a group.
-
-    Raises:
-        ConfigError: more groups than drives, a drive twice, or a file that does not fit.
     """
     known = {drive.session.id for drive in drives}
     if len(known) < len(drives):
@@ -131,11 +116,7 @@ def group_drives(
 
 
 def read_groups(path: Path, drives: Sequence[Drive]) -> list[list[Drive]]:
-    """Groups from a text file: one a line, the names of its drives between spaces; # comments.
-
-    Raises:
-        ConfigError: the file cannot be read, or does not name every drive once.
-    """
+    """Groups from a text file: one a line, the names of its drives between spaces; # comments."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -186,7 +167,6 @@ def _by_condition(drives: Sequence[Drive], seed: int) -> list[Drive]:
 
 
 def _split(ordered: Sequence[Drive], groups: int) -> list[list[Drive]]:
-    """Consecutive parts of the order, whose sizes differ by at most one."""
     size, larger = divmod(len(ordered), groups)
     borders = [0]
     for number in range(groups):
@@ -226,20 +206,8 @@ def find_best_order(
     all that they depend on, so an interrupted search continues.
 
     Args:
-        maps: the groups' maps, by number.
-        folder: for intermediate maps and results.
-        settings: of the localiser.
-        merging: policy and budget of the merges.
-        judge: how an order is judged.
         monitor: receives progress per order.
         root: the map that all orders begin with; None if each begins with its first group's.
-
-    Raises:
-        ConfigError: there are too many groups to try all orders, or a judging drive is in one of
-            the maps.
-        MapError: another process wrote to the root, or the folder cannot be written.
-        StorageFullError: no space is left.
-        KeyboardInterrupt: a merge was interrupted.
     """
     check_countable(len(maps), judge.orders)
     with keeping(folder):
@@ -280,8 +248,6 @@ class _Step:
 
 
 class _Search:
-    """The walk over the prefix tree."""
-
     def __init__(
         self,
         maps: Sequence[Path],
@@ -436,8 +402,6 @@ class _Search:
 
 
 class _Intermediate:
-    """A map that exists while its part of the tree is walked."""
-
     def __init__(self, folder: Path, order: tuple[int, ...]) -> None:
         self._path = folder / f"order-{'-'.join(map(str, order))}.engram"
 
@@ -466,12 +430,7 @@ class BuildOptions:
     """How a map is built.
 
     Attributes:
-        workers: parallel processes on this machine.
-        groups: how many the drives are split into.
         grouping: key of `GROUPINGS`, or path of a file of groups.
-        seed: of the grouping.
-        mapping: how each drive is mapped.
-        merging: how the groups' maps are merged.
         scheduler: address of a Dask scheduler; None to use processes on this machine.
         judge: how the best order of merging is found; None to merge in the order of the groups.
     """
@@ -497,17 +456,12 @@ class BuildReport:
     """The result of a build.
 
     Attributes:
-        centre: the map.
         left_out: names of the drives that the fleet map has already.
         groups: names of the drives of each group, in the order of merging.
-        mapped: the result of mapping each group.
         merges: one report per merge of this run; the first group's map becomes a new fleet map.
         merged_before_s: time of the merges of earlier runs of this build, seconds.
         best: how the order was found; None if it was given.
-        notes: warnings.
         interrupted: whether it was stopped; the same command continues it.
-        content_hash: of the map.
-        seconds: wall time of this run.
     """
 
     centre: str
@@ -643,7 +597,6 @@ def _build(
     *,
     keep: bool,
 ) -> BuildReport:
-    """The build, under the lock of the fleet map."""
     scratch = Scratch(centre)
     known = _known_sessions(scratch)
     grouped = group_drives(looked_at, options.grouping, options.groups, options.seed, known)
@@ -728,11 +681,6 @@ def _map_and_merge(
     monitor: Monitor,
     report: BuildReport,
 ) -> None:
-    """The build, as far as this run takes it.
-
-    Raises:
-        KeyboardInterrupt: the user stopped the mapping or the trying of orders.
-    """
     mapped = _map(scratch, grouped, settings, options, monitor)
     begun = _settled_order(scratch, len(grouped), settings, options, monitor)
     report.best = begun.best
@@ -749,7 +697,6 @@ def _map(
     options: BuildOptions,
     monitor: Monitor,
 ) -> list[GroupResult]:
-    """Maps the groups that are not mapped yet, and stores their results."""
     tasks = [
         GroupTask(
             number, scratch.group(number), [one.source for one in group], settings, options.mapping
@@ -772,7 +719,6 @@ def _map(
 
 
 def _map_here(tasks: Sequence[GroupTask], workers: int, monitor: Monitor, scratch: Scratch) -> None:
-    """Maps groups in processes on this machine."""
 
     def done(name: str, result: GroupResult, retries: int) -> None:
         del name
@@ -785,11 +731,7 @@ def _map_here(tasks: Sequence[GroupTask], workers: int, monitor: Monitor, scratc
 def _settled_order(
     scratch: Scratch, groups: int, settings: Settings, options: BuildOptions, monitor: Monitor
 ) -> MergingBegun:
-    """The order of merging, stored before the first merge so that it cannot change half way.
-
-    Raises:
-        ConfigError: merging has begun in an order that other options found.
-    """
+    """The order of merging, stored before the first merge so that it cannot change half way."""
     judge = options.judge
     judged_by = None if judge is None else _judged_by(judge)
     begun = scratch.merging_begun()

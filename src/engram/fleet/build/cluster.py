@@ -40,10 +40,7 @@ def map_groups_on_cluster(
     `run_on_cluster`.
 
     Args:
-        tasks: the groups.
-        scheduler: address of the Dask scheduler.
         monitor: receives progress per frame; an exception of its `check` stops the workers too.
-        mapped: called with each finished group.
     """
     named = {f"group {task.number}": task for task in tasks}
 
@@ -56,7 +53,6 @@ def map_groups_on_cluster(
 
 
 def _map_group(task: GroupTask, monitor: Monitor) -> tuple[GroupResult, bytes]:
-    """Runs in the worker."""
     return map_group_far_away(task, monitor)
 
 
@@ -71,16 +67,8 @@ def run_on_cluster(
 
     Args:
         work: a function of a module, as for `run_in_processes`; it shares no disk with the caller.
-        tasks: name → task.
-        scheduler: address of the Dask scheduler.
         monitor: receives the words of all tasks; an exception of its `check` stops the workers too.
         done: called for each finished task with its name and result.
-
-    Raises:
-        MissingExtraError: Dask is not installed.
-        WorkerError: the scheduler cannot be reached or is lost, or a task's workers died
-            repeatedly.
-        EngramError: raised by a task.
     """
     heard: queue.SimpleQueue[list[str] | Future] = queue.SimpleQueue()
     topic = f"engram-{uuid4().hex}"
@@ -111,10 +99,6 @@ def check_scheduler(scheduler: str) -> None:
     """Checks that a scheduler answers, before any work begins.
 
     Without a Dask client: one that fails to connect takes half a minute to close.
-
-    Raises:
-        MissingExtraError: Dask is not installed.
-        WorkerError: the address is not valid, or no scheduler answers there.
     """
     try:
         from distributed import Security
@@ -141,12 +125,7 @@ def check_scheduler(scheduler: str) -> None:
 
 
 def _connected(scheduler: str) -> Client:
-    """A client of its own, not registered as Dask's default.
-
-    Raises:
-        MissingExtraError: Dask is not installed.
-        WorkerError: the scheduler does not answer.
-    """
+    """A client of its own, not registered as Dask's default."""
     try:
         from distributed import Client
     except ImportError as error:
@@ -195,12 +174,7 @@ def _on_worker(
 
 
 def _outcome(future: Future, name: str, scheduler: str) -> tuple[Any, list[str]]:
-    """The result of a task, fetched from the worker, and its last words.
-
-    Raises:
-        WorkerError: the cluster failed.
-        EngramError: raised by the task.
-    """
+    """The result of a task, fetched from the worker, and its last words."""
     try:
         outcome: tuple[Any, list[str]] | EngramError = future.result()
     except CancelledError as error:

@@ -56,12 +56,10 @@ class JudgeOptions:
         drives: validation sessions, held out of the groups and of every reported figure.
         judge_at_m: longest acceptable distance x without a match, metres: the order with the
             lowest P(X ≥ x) is best.
-        localising: policy and budget of the validation.
         reported: test sessions, not used for the choice: they measure the quality of the chosen
             order.
         localise: how a drive is localised in a map; None for `measure`. Stored results are
             assumed to come from the same function.
-        orders: which are tried.
         estimator: what P is taken over.
     """
 
@@ -85,9 +83,6 @@ class JudgeOptions:
         """Hash of all that a judgement depends on: drives, distance, localising.
 
         It leaves out which orders are tried, so that known judgements are reused.
-
-        Raises:
-            SequenceError: a drive cannot be read.
         """
         sessions = [
             [str(session_of_drive(open_drive(path)).id) for path in paths]
@@ -103,12 +98,7 @@ def check_held_out(judge: JudgeOptions, mapped: Sequence[tuple[Session, str]]) -
     """Refuses judging drives that are in a map, or given twice.
 
     Args:
-        judge: the drives that must be held out.
         mapped: the sessions of the maps, each with its place in words.
-
-    Raises:
-        ConfigError: a drive is not held out; names it.
-        SequenceError: a drive cannot be read.
     """
     where = {one.id: words for one, words in mapped}
     known = [one for one, _ in mapped]
@@ -125,11 +115,7 @@ def check_held_out(judge: JudgeOptions, mapped: Sequence[tuple[Session, str]]) -
 
 
 def check_countable(groups: int, orders: Orders) -> None:
-    """Refuses more groups than orders can be tried for.
-
-    Raises:
-        ConfigError: there are too many, or none.
-    """
+    """Refuses more groups than orders can be tried for."""
     if groups < 1:
         raise ConfigError("there are no groups to merge")
     if orders is Orders.ALL and groups > _MOST_GROUPS:
@@ -144,12 +130,9 @@ class OrderResult:
     """One order and the results of the validation drives in its map.
 
     Attributes:
-        order: numbers of the groups.
         judged: P(X ≥ x) at the distance judged by.
         area_m: area under the failure curve to 50 m.
         at_m: P(X ≥ x) by distance x, at 5, 10 and 20 m.
-        nodes: of the map.
-        content_hash: of the map.
         reported: P(X ≥ x) of the test sessions, every half metre from 0 to 50; empty
             without such sessions.
         reported_missed: share of their route without a match.
@@ -175,7 +158,6 @@ class Spent:
     """Cost of the search, steps of earlier runs included.
 
     Attributes:
-        merges, copies: made.
         merge_s, copy_s, judge_s: wall time of those and of judging, seconds.
         replayed, attempts, proposed, lookups: nodes replayed in merging, match attempts,
             attempts at proposed nodes, and nodes for which the relocaliser ran.
@@ -202,10 +184,8 @@ class BestOrder:
     Attributes:
         results: one per order, best first.
         judge_at_m: distance x at which they were judged, metres.
-        tried: which orders of the groups.
         rooted: whether every order began with an existing fleet map, not with its first group.
         spent: cost of this search over all its runs; work undone by an interruption counts once.
-        estimator: what P was taken over.
     """
 
     results: list[OrderResult] = field(default_factory=list)

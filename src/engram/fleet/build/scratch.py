@@ -37,11 +37,7 @@ class GroupTask:
     """Sessions to be mapped one after another into a map of their own.
 
     Attributes:
-        number: of the group.
-        path: the group's map.
         sources: paths or fsspec URLs of the drives, in the order of mapping.
-        settings: the resolved configuration.
-        options: how each drive is mapped.
     """
 
     number: int
@@ -56,9 +52,7 @@ class GroupResult:
     """The result of mapping a group.
 
     Attributes:
-        number: of the group.
         seconds: wall time of the runs that mapped it; the last run only, after a worker died.
-        cpu_s: processor time of the same runs.
         sessions: one summary each, as in ``map --json``.
         nodes: of the group's map.
         retries: number of workers that died on it.
@@ -77,14 +71,6 @@ def map_group(task: GroupTask, monitor: Monitor = QUIET) -> GroupResult:
 
     Sessions that the map holds are skipped. An interrupted session is mapped again from its start,
     so the death of a worker does not change the result.
-
-    Args:
-        task: what to map, and where.
-        monitor: receives progress per frame.
-
-    Raises:
-        MapError: the map cannot be written.
-        SequenceError: a drive cannot be read.
     """
     result = GroupResult(task.number)
     started, cpu_started = time.perf_counter(), time.process_time()
@@ -116,12 +102,7 @@ def map_group_far_away(task: GroupTask, monitor: Monitor = QUIET) -> tuple[Group
 
 @contextmanager
 def fetched(source: str) -> Iterator[Path]:
-    """Local path of a drive; one at a URL is copied.
-
-    Raises:
-        MissingExtraError: a URL, and fsspec is not installed.
-        SequenceError: the URL cannot be read.
-    """
+    """Local path of a drive; one at a URL is copied."""
     if "://" not in source:
         yield Path(source)
         return
@@ -151,9 +132,6 @@ class BuildPlan:
     Attributes:
         groups: sessions of each group, in the order of mapping.
         known: sessions that the fleet map had when the build began, sorted.
-        settings: hash of the resolved configuration.
-        mapping: how each drive is mapped.
-        merging: how the groups' maps are merged.
         complete: whether the fleet map has all groups; the folder is then needed only if `kept`.
         kept: whether the groups' maps are kept after the build.
     """
@@ -184,9 +162,7 @@ class MergingBegun:
     """The order of merging, fixed before the first merge.
 
     Attributes:
-        order: numbers of the groups.
         judge: `JudgeOptions.hash` of the judgement; None if no orders were tried.
-        best: the orders tried and their results.
         seconds: wall time of each group's committed merge, by its number as text.
     """
 
@@ -198,12 +174,7 @@ class MergingBegun:
 
 @contextmanager
 def keeping(folder: Path) -> Iterator[None]:
-    """Converts file system errors in a build's folder into Engram's.
-
-    Raises:
-        StorageFullError: no space is left.
-        MapError: the folder or a file in it cannot be made, read, written or removed.
-    """
+    """Converts file system errors in a build's folder into Engram's."""
     try:
         yield
     except OSError as error:
@@ -227,10 +198,6 @@ def sole_builder(centre: Path) -> Iterator[None]:
 
     The lock file is next to the folder, since the folder is removed and made again. The lock ends
     with its process, so a killed build can continue at once.
-
-    Raises:
-        MapLockedError: another process builds into it; names process and host.
-        MapError: the lock cannot be made there.
     """
     folder = build_folder(centre)
     try:
@@ -266,11 +233,7 @@ class Scratch:
         return None if self.plan is None or self.plan.complete else self.plan
 
     def begin(self, plan: BuildPlan) -> None:
-        """Starts or continues a build; kept maps of the groups are used again.
-
-        Raises:
-            ConfigError: the folder holds other data, which might be needed.
-        """
+        """Starts or continues a build; kept maps of the groups are used again."""
         if (unfinished := self.unfinished) is not None:
             if not unfinished.same_build(plan):
                 raise ConfigError(
@@ -293,8 +256,7 @@ class Scratch:
     def finish(self) -> None:
         """Marks the build as complete and removes its maps unless they are to be kept.
 
-        Raises:
-            MapError: a drive of the groups is missing from the fleet map; nothing is removed.
+        If the fleet map no longer has one of their drives, nothing is removed.
         """
         assert self.plan is not None
         missing = _missing(self.centre, self.plan)
@@ -418,17 +380,12 @@ def sessions_of(centre: Path) -> frozenset[str]:
 
 
 def _missing(centre: Path, plan: BuildPlan) -> list[str]:
-    """Sessions of the groups that are missing from the centre."""
     wanted = {session for group in plan.groups for session in group}
     return sorted(wanted - sessions_of(centre))
 
 
 def read_kept(path: Path, kind: type[Kept]) -> Kept:
-    """Reads a file of a build.
-
-    Raises:
-        ConfigError: the file cannot be read, or has other content.
-    """
+    """Reads a file of a build."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind)
     except (OSError, msgspec.MsgspecError) as error:

@@ -381,8 +381,6 @@ class Demand:
         """Places from all nodes, weights from path memory.
 
         Args:
-            stock: the centre.
-            options: when the mission is.
             where: (N,) nodes along its route; None for anywhere.
         """
         places, place_of = _places(stock)
@@ -416,15 +414,7 @@ def _places(stock: Stock) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 class Coverage:
-    """The expected share of a mission's route with a match, as nodes are added one by one.
-
-    Args:
-        stock: the centre.
-        demand: of the mission.
-
-    Attributes:
-        demand: of the mission.
-    """
+    """The expected share of a mission's route with a match, as nodes are added one by one."""
 
     def __init__(self, stock: Stock, demand: Demand) -> None:
         self.demand = demand
@@ -516,7 +506,6 @@ def greedy_order(
     to the lower index.
 
     Args:
-        coverage: of the mission; its subset is replaced.
         size_bytes: (N,) float64, bytes of each node.
         spare: (N,) int64, all nodes in the order in which they fill the rest.
     """
@@ -623,8 +612,6 @@ class Forecast:
 
         Args:
             expected: share of the route without a match by `Coverage`.
-            lost: of that, by nodes that are left out.
-            drives: sessions in the map.
             light: whether the map contains drives in the mission's light.
         """
         place = int(np.digitize(lost, BINS[1:-1]))

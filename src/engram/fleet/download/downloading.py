@@ -49,16 +49,12 @@ class DownloadReport:
     """What was sent, and its forecast.
 
     Attributes:
-        out: the file.
         select: key of `SELECTIONS`.
-        revision: of the centre.
-        source_hash, content_hash: of the fleet map and of the file.
         nodes, of_nodes: sent, and all.
         sessions, partial_paths: sent; paths of which entries were left out.
         edges, bridges: sent; how many of them were composed.
         components: connected components; as many as the same nodes have in the fleet map.
         size_bytes, of_bytes: of the file, and of the fleet map's.
-        why: facts of the selection, as plain data.
         expected_missed, copy_missed: expected share of the mission's route without a match,
             with the nodes sent and with all nodes.
         forecast: interval of the first, by missions in other towns.
@@ -209,12 +205,9 @@ def most_that_fit(
     Args:
         measure: writes the file of the first n nodes and returns its size, bytes.
         expected_bytes: (N,) float64, expected bytes of the first 1, 2, … N nodes; increasing.
-        budget_bytes: largest size of the file.
-
-    Raises:
-        InputError: not even one node fits.
 
     Source: regula falsi, with the Illinois algorithm's halving if one end stays (Dowell and
+
     Jarratt, BIT 11, 1971): sizes bend where later nodes bring fewer edges.
     """
     fits, fits_bytes = 1, measure(1)
@@ -303,7 +296,6 @@ def _report(
     out: Path,
     options: DownloadOptions,
 ) -> DownloadReport:
-    """The report of a file that will be named `out`."""
     stock, sent = part.stock, part.sent
     missed = expected_missed(coverage, sent)
     copy_missed = expected_missed(coverage, stock.everything())

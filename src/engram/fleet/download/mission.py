@@ -84,11 +84,7 @@ class DownloadOptions:
 
 
 def hour_from_text(text: str | None, name: str) -> float | None:
-    """Hour of day of "9", "9:30" or "09:30"; None of None.
-
-    Raises:
-        ConfigError: the text is not a time of day.
-    """
+    """Hour of day of "9", "9:30" or "09:30"; None of None."""
     if text is None:
         return None
     found = _CLOCK.fullmatch(text.strip())
@@ -101,9 +97,6 @@ def budget_from_text(text: str | None) -> tuple[int | None, float | None]:
     """Bytes of "200MB", "1.5 GiB" or "4096", or per cent of "25%"; the other is None.
 
     Both are None if `text` is.
-
-    Raises:
-        ConfigError: the text is neither a size nor a share.
     """
     if text is None:
         return None, None

@@ -58,8 +58,6 @@ class Stock:
     """A fleet map as of one revision, for selections.
 
     Attributes:
-        store: the map.
-        contents: its records in the order of the store.
         sessions: in the order of their starts, then UUIDs.
         nodes: by session, then stamp, then UUID.
         index: place of each node in `nodes`.
@@ -120,11 +118,7 @@ class Stock:
         return np.array([np.nan if hour is None else hour for hour in known], np.float64)
 
     def known_hours(self) -> Array:
-        """`hours` (N,), at least one of which is known.
-
-        Raises:
-            InputError: all are unknown.
-        """
+        """`hours` (N,), at least one of which is known."""
         if not np.isfinite(self.hours).any():
             without = [one for one in self.sessions if hour_of_day(one, one.start_ns) is None]
             listed = ", ".join(f"{one.robot} {str(one.id)[:8]}" for one in without[:_LISTED])
@@ -178,11 +172,7 @@ class Stock:
         return both[:, 0], both[:, 1]
 
     def named_node(self, prefix: str) -> int:
-        """Dense index of the one node whose UUID begins with `prefix`.
-
-        Raises:
-            InputError: no node or several match, or a revert has hidden it.
-        """
+        """Dense index of the one node whose UUID begins with `prefix`."""
         origin = self.store.origin(prefix)
         if origin.node not in self.index:
             raise InputError(f"node {origin.node} was reverted in revision {origin.told[-1][0]}")
@@ -213,8 +203,6 @@ def close_gaps(
     """Bridges between sent nodes, composed through omitted nodes.
 
     Args:
-        nodes: all nodes of the graph.
-        edges: all its edges.
         sent: (N,) bool, which nodes are sent.
 
     Returns:
@@ -312,7 +300,6 @@ class _Search:
         return self._spanning(ordered), self._nearest(ordered)
 
     def _spanning(self, ordered: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Kruskal's tree over the components of the sent nodes."""
         root = {int(label): int(label) for label in np.unique(self._joined)}
 
         def find(label: int) -> int:
@@ -381,11 +368,8 @@ class Part:
     """A part of a fleet map, complete in itself.
 
     Attributes:
-        stock: the fleet map.
         sent: (N,) bool, which of its nodes go along.
-        bridges: composed edges that close the gaps.
         whole: whether omissions go along, as they do with a copy of everything.
-        thumbnails: whether thumbnails go along.
     """
 
     stock: Stock
@@ -461,7 +445,6 @@ class Part:
         """Writes a session; returns whether it was new.
 
         Args:
-            writer: of the map that receives the part.
             session: one of `sessions`.
             partial: `partial_paths`.
         """

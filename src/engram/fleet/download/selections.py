@@ -39,7 +39,6 @@ class PathCounts:
     """PCM: number of nodes of each path by epoch of the day (Algorithm 2).
 
     Attributes:
-        paths: in the order of their UUIDs.
         counts: (P, K) int64.
         epoch_min: length Δt of an epoch, minutes.
     """
@@ -117,9 +116,6 @@ def mission_epochs(
     A start that is missing or before the first epoch with data becomes that epoch; an end that is
     missing or after the last one becomes that one. A start later than the end runs over midnight
     and is not clamped. The buffer is applied first.
-
-    Raises:
-        InputError: no epoch of the mission has data.
     """
     filled = np.flatnonzero(counts.counts.sum(axis=0))
     if not len(filled):
@@ -213,13 +209,7 @@ def near_start(stock: Stock, options: DownloadOptions, where: Mask) -> tuple[Mas
     """(N,) bool, nodes of some places within the window of the mission's start; and facts.
 
     Args:
-        stock: the fleet map.
-        options: the mission.
         where: (N,) bool, the nodes of its route or region.
-
-    Raises:
-        ConfigError: the mission has no start.
-        InputError: no hour is known; or, if `strict`, no node fits.
     """
     if options.depart_h is None:
         raise ConfigError(f"selection {options.select} needs --depart, the mission's time of day")
@@ -243,11 +233,7 @@ def near_start(stock: Stock, options: DownloadOptions, where: Mask) -> tuple[Mas
 def best_paths(
     stock: Stock, options: DownloadOptions, counted: Mask
 ) -> tuple[list[PathId], dict[str, Any]]:
-    """The best paths of the mission's epochs, by counts over some nodes; and facts.
-
-    Raises:
-        InputError: no counted node has a known hour; or, if `strict`, no epoch has data.
-    """
+    """The best paths of the mission's epochs, by counts over some nodes; and facts."""
     counts = count_paths(stock.on_path, stock.hours, options.epoch_min, counted)
     epochs, facts = _epochs(counts, options)
     rows = sorted({row for epoch in epochs for row in counts.best(epoch, options.best_percent)})
@@ -311,7 +297,6 @@ class Selection:
 
     Attributes:
         sent: (N,) bool, which nodes of the stock are sent.
-        why: facts of the selection, as plain data.
         order: for `budget`: (N,) nodes by gain, of which a first part is sent; else None.
         coverage: the forecast that the selection used; else None.
     """
@@ -418,12 +403,7 @@ _OPEN_START = frozenset({"paths", "tod+paths"})
 
 
 def check_options(options: DownloadOptions) -> None:
-    """Refuses options that a selection would ignore.
-
-    Raises:
-        ConfigError: the selection is unknown, does not use an option that was given, or needs
-            another option with it.
-    """
+    """Refuses options that a selection would ignore."""
     select = options.select
     if select not in SELECTIONS:
         raise ConfigError(f"selection {select!r} is unknown; known: {', '.join(SELECTIONS)}")
@@ -480,11 +460,7 @@ def within(stock: Stock, seeds: NDArray[np.int64], radius_m: float) -> Mask:
 
 
 def along_route(stock: Stock, session: str, radius_m: float) -> Mask:
-    """(N,) bool, the nodes within a distance of a session's path, along the edges.
-
-    Raises:
-        InputError: no session or several match the prefix, or its path has no node.
-    """
+    """(N,) bool, the nodes within a distance of a session's path, along the edges."""
     found = stock.store.named_session(session)
     seeds = stock.on_path.get(path_id(found.id))
     if seeds is None:

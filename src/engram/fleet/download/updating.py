@@ -48,14 +48,11 @@ class UpdateReport:
     Attributes:
         out: the robot's map.
         select: key of `SELECTIONS`.
-        source_revision: of the fleet map.
         revision: the new one of the robot's map; None if nothing was missing.
         content_hash: of the robot's map.
         nodes, of_nodes: copied; those of the download.
         own_nodes: nodes of the robot's map that the download does not have.
-        sessions, edges, path_entries, attempts: copied.
         ties: new edges between own nodes and the nodes by which the fleet map replaced them.
-        why: facts of the selection, as plain data.
     """
 
     out: Path
@@ -112,14 +109,6 @@ def update(
         at: revision of the fleet map; None for the newest.
         monitor: receives progress per copied node.
         message: of the revision; None names the download.
-
-    Raises:
-        ConfigError: an option is missing, out of range, or not used by the selection.
-        InputError: no node fits the options, or both maps are the same file.
-        IncompatibleError: the maps have different kinds of descriptors, or hold a session or a node
-            of one UUID with different content.
-        MapLockedError: another process writes to the robot's map.
-        MapError: a map cannot be read or written.
 
     After any error, and after a kill, the robot's map is as it was.
     """
@@ -184,7 +173,6 @@ class _Update:
         return revision
 
     def _write_owners(self, writer: RevisionWriter, monitor: Monitor) -> bool:
-        """Sessions, amendments and nodes."""
         partial = self._part.partial_paths()
         for session in self._part.sessions:
             self._counts["sessions"] += self._part.add_session(writer, session, partial)
@@ -199,7 +187,6 @@ class _Update:
         return any(amended) or any(self._counts.values())
 
     def _write_the_rest(self, writer: RevisionWriter) -> bool:
-        """Records that refer to nodes."""
         edges = list(self._lacking_edges())
         ties = list(self._lacking_ties({_key(edge) for edge in edges}))
         entries = list(self._lacking_entries())
@@ -233,7 +220,6 @@ class _Update:
         return np.array([node not in known for node in self._stock.node_ids], np.bool_)
 
     def _lacking_edges(self) -> Iterator[Edge]:
-        """Edges that are missing from the robot's map, or less exact in it."""
         known = {_key(edge): uncertainty_m2(edge.covariance) for edge in self._own.edges}
         removed = Removed(self._map.removals)
         for edge in self._part.edges():
@@ -292,7 +278,6 @@ def _key(edge: Edge) -> tuple[NodeId, NodeId, EdgeKind]:
 
 
 def _check_fits(part: Part, own: Map, contents: MapContents) -> None:
-    """Refuses a download that contradicts the robot's map."""
     known = {one.id: one.as_recorded for one in contents.sessions}
     for session in part.sessions:
         ours = known.get(session.id)

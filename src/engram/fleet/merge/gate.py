@@ -50,13 +50,6 @@ def check_held_out(
 
     Args:
         drives: the judging drives, each with its name for messages.
-        sessions: of a map that takes part.
-        where: the map.
-        option: the option that gave the drives, for messages.
-
-    Raises:
-        ConfigError: a map holds one of the drives.
-        SequenceError: a drive cannot be read.
     """
     sessions = list(sessions)
     for name, sequence in drives:
@@ -69,11 +62,7 @@ def check_held_out(
 
 
 def held_as(sequence: DriveSequence, sessions: Sequence[Session]) -> Session | None:
-    """The session of this drive, whatever the robot's name; None if it is not in the map.
-
-    Raises:
-        SequenceError: the drive cannot be read.
-    """
+    """The session of this drive, whatever the robot's name; None if it is not in the map."""
     own = session_of_drive(sequence)
     for one in sessions:
         if one.id == own.id:
@@ -98,11 +87,6 @@ class Gate:
 
     Args:
         drives: folders of images or frame logs, in none of the maps.
-        settings: of localiser and odometry.
-        options: policy and budget.
-
-    Raises:
-        SequenceError: a drive cannot be read.
     """
 
     def __init__(
@@ -115,15 +99,7 @@ class Gate:
         self._before: list[Drive] | None = None
 
     def check_held_out(self, sessions: Iterable[Session], where: Path) -> None:
-        """See the function of this name.
-
-        Args:
-            sessions: of a map that takes part in the merge.
-            where: the map.
-
-        Raises:
-            ConfigError: one of them is one of the drives.
-        """
+        """See the function of this name."""
         drives = zip(self._paths, self._sequences, strict=True)
         check_held_out(drives, sessions, where, "--require-better")
 
@@ -136,12 +112,7 @@ class Gate:
         """Measures the drives in the merged map.
 
         Args:
-            store: the fleet map, within the merge.
-            robot: name of the map being merged.
             monitor: its `check` is called between two frames.
-
-        Raises:
-            RefusedError: the drives localise worse in it.
         """
         assert self._before is not None
         before, after = self._before, self._localise(store, monitor)
@@ -207,7 +178,6 @@ class GeometryGate:
 
     Args:
         refuses: whether a merge that brings new ones is refused.
-        config: what counts as wrong.
     """
 
     def __init__(self, *, refuses: bool, config: RepairConfig | None = None) -> None:
@@ -222,11 +192,7 @@ class GeometryGate:
                 self._known = {_key(one) for one in self._wrong(store, monitor)}
 
     def __call__(self, store: Map, source: str, monitor: Monitor) -> list[dict[str, Any]]:
-        """The wrong edges of the fleet map with an open merge, as plain values.
-
-        Raises:
-            RefusedError: some of them are new.
-        """
+        """The wrong edges of the fleet map with an open merge, as plain values."""
         wrong = self._wrong(store, monitor)
         new = [one for one in wrong if _key(one) not in self._known]
         if self._refuses and new:

@@ -67,11 +67,7 @@ class Gates:
                 gate.look_at(place, monitor)
 
     def check(self, merge: Merge, monitor: Monitor) -> None:
-        """Checks the open revision of a merge.
-
-        Raises:
-            RefusedError: it does not pass.
-        """
+        """Checks the open revision of a merge."""
         centre, source = merge.centre, merge.robot.location
         if self.held_out is not None:
             merge.report.held_out = self.held_out(centre, source, monitor)
@@ -89,18 +85,12 @@ def merge_one(
 ) -> MergeReport:
     """Merges one robot's map into the fleet map: one revision, or none if nothing is new.
 
+    If it raises, the fleet map is unchanged.
+
     Args:
-        centre: the fleet map, open for writing.
         robot: the robot's map.
         settings: of localiser, mapper and map frame.
-        options: policy and budget.
-        gates: check the result before it is committed.
         monitor: receives progress; its `check` is called wherever the merge can still be undone.
-
-    Raises:
-        IncompatibleError: the map does not fit the fleet map.
-        RefusedError: the gate refuses the result. The fleet map is unchanged.
-        MapError: a map cannot be read or written. The fleet map is unchanged.
     """
     merge = Merge(centre, robot)
     check_fits(merge)
@@ -294,12 +284,7 @@ def _keep_words(merge: Merge, descriptor: DescriptorKind) -> None:
 
 
 def _say_what_hangs_together(merge: Merge, before: int) -> None:
-    """Counts the components of the fleet map, and notes added nodes that are not connected to it.
-
-    Args:
-        merge: the finished merge.
-        before: number of nodes before the merge.
-    """
+    """Counts the components of the fleet map; notes added nodes that are not connected to it."""
     report, labels = merge.report, merge.graph.components()
     report.components = int(labels.max(initial=-1)) + 1
     if not (report.taken and before):

@@ -66,7 +66,6 @@ class Held:
         stored, live: the node, and its frame.
         found: its localisation; not localised once its fix is withdrawn.
         outcomes: of the frame's attempts.
-        attempts: as a map stores them.
     """
 
     stored: StoredNode
@@ -95,7 +94,6 @@ class Segment:
     """A chain of nodes of one session, in the order of time.
 
     Attributes:
-        nodes: at least one.
         steps: the odometry edges between them, one fewer than nodes; each in its stored
             direction.
     """
@@ -187,12 +185,7 @@ _BASE_LINE_M = 4.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ahead:
-    """A node of a segment that was localised ahead of its turn.
-
-    Attributes:
-        found: its localisation.
-        outcomes: outcomes of its attempts.
-    """
+    """A node of a segment that was localised ahead of its turn."""
 
     found: Localisation
     outcomes: list[Outcome]
@@ -205,9 +198,6 @@ def position_behind_gap(
 
     Args:
         end: position of the last node of the segment before.
-        before: the segment before, of the same session.
-        segment: the one behind the gap.
-        config: how far a guess is trusted.
 
     Returns:
         The guess with its covariance (`GapFiller`); None if the speed is unknown, or if the robot
@@ -231,7 +221,6 @@ def look_along(robot: Robot, frames: Iterable[LoggedFrame]) -> tuple[Ahead | Non
 
     Args:
         robot: placed at the guess; it tries nowhere else.
-        frames: of the segment, in the order of time.
 
     Returns:
         The first of two matched frames at least 4 m apart, or None; and the number of attempts.
@@ -273,9 +262,6 @@ class Replay(Keeper):
     would omit or tie is held back until they have proved themselves.
 
     Args:
-        merge: the known and added records.
-        settings: of localiser and mapper.
-        options: policy and budget.
         monitor: receives the outcome of each node; its `check` is called after each.
 
     Attributes:
@@ -393,7 +379,6 @@ class Replay(Keeper):
         return Seed.NONE if self._ahead is None else Seed.GAP
 
     def _covers(self, session: Session, segment: Segment) -> bool:
-        """Whether the fleet map shows the segment as a whole."""
         if self._relocaliser is not None:
             self._relocaliser.forget()
         localiser = self._localiser_of(session, segment, self._relocaliser)
@@ -486,7 +471,6 @@ class Replay(Keeper):
 
         Args:
             node: of the robot's map.
-            kinds: kinds of edges that count.
             before: nodes from this dense index on do not count: those of the current run, which
                 carry no more information than odometry.
         """
@@ -524,7 +508,6 @@ class Replay(Keeper):
             self._monitor.advance("added" if reason else "covered")
 
     def _remember(self, node: Node, found: Localisation, attempts: list[Attempt]) -> None:
-        """Records the attempts and matches of a frame."""
         self.attempts[node.session] += attempts
         if found.node is not None and found.node != self._visited:
             self._visited = found.node
@@ -582,7 +565,6 @@ class Replay(Keeper):
                 self._merge.add_edge(moved)
 
     def _end_run(self) -> None:
-        """Ends a run of taken nodes and ties its far end."""
         run, self._run = self._run, []
         if run:
             proximity = self._settings.mapper.proximity

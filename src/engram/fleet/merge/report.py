@@ -58,9 +58,6 @@ class RunReport:
     """Consecutive nodes of a segment that were taken.
 
     Attributes:
-        first_stamp_ns: stamp of the first.
-        nodes: how many.
-        length_m: odometry distance from first to last.
         reason: the most frequent reason; of equals the first in `Reason`.
     """
 
@@ -75,7 +72,6 @@ class KeptNode:
     """The outcome of one node in a replay.
 
     Attributes:
-        stamp_ns: of the node.
         moved_m: odometry distance since the node before it.
         reason: why it was taken; None if it was omitted.
     """
@@ -90,12 +86,7 @@ class SegmentReport:
     """The outcome of one segment.
 
     Attributes:
-        session: UUID of the drive.
-        robot: name of the robot.
-        first_stamp_ns: stamp of its first node.
         seed: how the replay got its start position.
-        taken, omitted: nodes.
-        runs: the nodes taken, run by run.
     """
 
     session: str
@@ -176,12 +167,7 @@ class HeldOutFigures:
 
 @dataclass(frozen=True, slots=True)
 class HeldOutReport:
-    """The figures of a gate for a merge that it accepted.
-
-    Attributes:
-        drives: names of the held-out drives.
-        before, after: how they localise without and with it.
-    """
+    """The figures of a gate for a merge that it accepted."""
 
     drives: Sequence[str]
     before: HeldOutFigures
@@ -207,29 +193,21 @@ class MergeReport:
     """The result of merging one robot's map.
 
     Attributes:
-        source: the robot's map.
-        source_hash: its content hash.
         robots: names of the robots whose drives it holds.
         revision: number of the new revision; None if nothing changed, and in a dry run.
         changed: whether the fleet map changed, or in a dry run would have.
         dry_run: whether the fleet map was left unchanged on purpose.
         interrupted: whether it was stopped; the fleet map is then unchanged by it.
         content_hash: of the fleet map afterwards; in a dry run, of the map that would result.
-        sessions: number of drives new to the fleet map.
         known, known_omissions: nodes that the fleet map had, or had omitted before.
-        taken, omitted: nodes.
-        edges, path_entries: how many were added.
         attempts: number of remembered attempts new to the fleet map.
         match_attempts: match attempts of the replay: the cost of the merge.
         proposed_attempts: those at nodes proposed by place recognition; each costs a quarter.
         lookups: frames of the replay for which the relocaliser ran.
-        seconds: wall time.
         components: connected components of the fleet map afterwards.
-        held_out: localisation of held-out drives before and after; None without a gate.
         moved: what moved in the map frame; None if the map is unchanged.
         wrong_edges: wrong edges of the result; None if they were not looked for.
         segments: one report each, in the order of replay.
-        notes: warnings.
     """
 
     source: str
@@ -296,7 +274,6 @@ class MergeReport:
         return "\n".join(lines)
 
     def _drives(self) -> list[list[SegmentReport]]:
-        """The segments of each drive, in the order of replay."""
         found: dict[str, list[SegmentReport]] = {}
         for one in self.segments:
             found.setdefault(one.session, []).append(one)
@@ -312,16 +289,7 @@ class MergeReport:
 
 
 def picture_before_and_after(centre: Path, before: int, path: Path) -> None:
-    """Draws the nodes of the fleet map by robot, as of a revision and now.
-
-    Args:
-        centre: the map.
-        before: number of the revision to compare with.
-        path: image file.
-
-    Raises:
-        MissingExtraError: Matplotlib is not installed.
-    """
+    """Draws the nodes of the fleet map by robot, as of a revision and now."""
     panels = []
     for at in (before, None):
         with open_map(centre, at) as opened:
@@ -331,7 +299,6 @@ def picture_before_and_after(centre: Path, before: int, path: Path) -> None:
 
 
 def _tracks(opened: Map) -> list[Track]:
-    """One per robot."""
     places_m = opened.frame.positions[:, :2]
     robots = np.array([opened.sessions[node.session].robot for node in opened.graph.nodes], object)
     return [

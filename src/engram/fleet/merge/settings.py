@@ -37,7 +37,6 @@ def localises_well(robot: Robot, frames: Iterable[LoggedFrame], least_share: flo
 
     Args:
         robot: placed at the segment's start, if that is known.
-        frames: of the segment, in the order of time.
         least_share: share of the frames that must localise, in [0, 1].
     """
     found = [robot.step(logged).localised for logged in frames]
@@ -54,7 +53,6 @@ class MergeSettings:
     Attributes:
         lanes, rounds: the budget of each replayed frame, lost or not: a count, so that the same
             input gives the same map.
-        ranking, relocaliser, sure_inliers, unit, segment_share, seed: see their descriptions.
     """
 
     ranking: Annotated[str, Meta(description="key of POLICIES")] = "recall"

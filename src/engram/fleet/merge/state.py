@@ -72,8 +72,6 @@ def beyond(known: Position, edge: Edge, node: NodeId) -> Position:
 
     Args:
         known: position of the edge's other end.
-        edge: of the node.
-        node: the end whose position is wanted.
     """
     other = edge.b if node == edge.a else edge.a
     _, other_from_node, covariance = seen_from(edge, other)
@@ -87,7 +85,6 @@ def recomposed(edge: Edge, a: Position, b: Position) -> Edge | None:
 
     Args:
         edge: as in the robot's map.
-        a, b: positions of its ends in the fleet map.
 
     Returns:
         The edge; None if both ends have the same equivalent.
@@ -126,7 +123,6 @@ class Merge:
         robot: the robot's map.
         sessions: of the robot's map, in the order of their starts.
         edges: of the robot's map, by their keys.
-        report: counts so far.
         writer: the open revision; set before the first addition.
     """
 
@@ -257,7 +253,6 @@ class Merge:
         """The robot's new attempts between known nodes, moved to the equivalents.
 
         Args:
-            sessions: of the fleet map.
             remembered: its attempts; `session` is a place in `sessions`.
 
         Returns:
@@ -343,11 +338,9 @@ _NAMED_OVERLAPS = 5
 
 
 def check_fits(merge: Merge) -> None:
-    """Refuses a map that would damage the fleet map.
+    """Refuses a map that contradicts the fleet map.
 
-    Raises:
-        IncompatibleError: it has another kind of descriptors, or a node or session whose UUID the
-            fleet map has with other content.
+    By another kind of descriptors, or a node or session of the same UUID with other content.
     """
     robot, known = merge.robot, merge.centre.sessions
     kind, theirs = merge.centre.descriptor, robot.descriptor
@@ -396,11 +389,7 @@ def _same_record(merge: Merge, node: NodeId) -> bool:
 
 
 def check_readable(robot: Map, nodes: Sequence[Node]) -> None:
-    """Reads all landmarks that may be taken once, before the fleet map is written.
-
-    Raises:
-        MapError: some of them are damaged.
-    """
+    """Reads all landmarks that may be taken once, before the fleet map is written."""
     for _ in robot.frames.stored(list(nodes)):
         pass
 
@@ -411,7 +400,6 @@ def notes(merge: Merge, now_ns: int) -> list[str]:
     Drives that the fleet map has are left out: their warnings were reported when they were merged.
 
     Args:
-        merge: before anything is added.
         now_ns: the time, UTC.
     """
     robot = merge.robot
@@ -495,7 +483,6 @@ def overlapping(
 
 
 def _spans(merge: Merge) -> list[Span]:
-    """Spans of all sessions whose clock is UTC."""
     sessions = {**merge.centre.sessions, **merge.robot.sessions}
     last = {one.id: one.start_ns for one in sessions.values()}
     for node in (*merge.graph.nodes, *merge.robot.graph.nodes):

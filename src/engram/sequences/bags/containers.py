@@ -53,8 +53,6 @@ class Topic:
     """A topic of a bag.
 
     Attributes:
-        name: its name, such as /stereo/left/image_raw.
-        type: type of its messages, such as sensor_msgs/msg/Image.
         count: number of its messages; None if the bag has no index.
     """
 
@@ -68,9 +66,7 @@ class Record:
     """One message of a bag, not decoded.
 
     Attributes:
-        topic: its topic.
         received_ns: when it was recorded, ns.
-        data: the serialised message.
     """
 
     topic: str
@@ -82,7 +78,6 @@ class BagFile(Protocol):
     """One file of a bag.
 
     Attributes:
-        path: the file.
         is_ros1: whether its messages are serialised as in ROS 1, else as CDR.
     """
 
@@ -91,9 +86,6 @@ class BagFile(Protocol):
 
     def topics(self, lost: Report) -> dict[str, Topic]:
         """The topics by name.
-
-        Args:
-            lost: receives what cannot be read.
 
         Raises:
             DamageError: the file is of another kind, or nothing can be read.
@@ -105,7 +97,6 @@ class BagFile(Protocol):
 
         Args:
             topics: names of topics; records of others are passed over undecoded.
-            lost: receives what cannot be read.
         """
         ...
 
@@ -144,7 +135,6 @@ def unpacked(data: bytes, kind: str, size: int | None = None, *, whole: bool = T
     """The content of a compressed block.
 
     Args:
-        data: the block.
         kind: "none" or "", "bz2", "lz4" (frames), "zstd".
         size: its stated size; None if it states none.
         whole: whether all of it is there; of a part, what unpacks is returned.
@@ -193,12 +183,7 @@ def _zstd() -> Any:
 
 
 def unpack_file(path: Path, folder: TemporaryDirectory[str]) -> Path:
-    """Unpacks NAME.mcap.zstd into a folder; returns the path of NAME.mcap there.
-
-    Raises:
-        SequenceError: it is damaged, or unpacks to more than a recording can.
-        MissingExtraError: the extra `bags` is not installed.
-    """
+    """Unpacks NAME.mcap.zstd into a folder; returns the path of NAME.mcap there."""
     out = Path(folder.name) / path.stem
     try:
         zstd = _zstd()
@@ -249,7 +234,6 @@ class _Contents:
         self.counts: dict[int, int] | None = None
 
     def note(self, code: int, content: bytes) -> None:
-        """Takes in a schema, channel or statistics record; ignores others."""
         parts = _Parts(content)
         if code == _SCHEMA:
             number = parts.number("<H")
@@ -265,11 +249,6 @@ class _Contents:
             self.counts = dict(struct.iter_unpack("<HQ", table[: len(table) // 10 * 10]))
 
     def topics(self, encoding: str) -> dict[str, Topic]:
-        """The topics by name, with counts if statistics were met.
-
-        Args:
-            encoding: of the messages that are read.
-        """
         found = {
             topic.name: topic_of(topic.name, topic.type, self.encodings[number], encoding)
             for number, topic in self.channels.items()
@@ -345,7 +324,6 @@ class McapBag:
         topics: Collection[str] | None,
         lost: Report,
     ) -> Iterator[Record]:
-        """Reads all chunks, and fills `contents` from them."""
         end = os.fstat(file.fileno()).st_size
         file.seek(len(_MCAP_MAGIC))
         while (at := file.tell()) < end:
@@ -419,18 +397,14 @@ def _content_or_part(file: BinaryIO, head: bytes) -> tuple[bytes, bool]:
 
 
 class _Parts:
-    """The parts of a record, one after another."""
-
     def __init__(self, content: bytes) -> None:
         self._content = content
         self._at = 0
 
     def skip(self, size: int) -> None:
-        """Passes over some bytes."""
         self._at += size
 
     def number(self, kind: str) -> int:
-        """The next number."""
         try:
             (value,) = struct.unpack_from(kind, self._content, self._at)
         except struct.error:
@@ -448,7 +422,6 @@ class _Parts:
         return part
 
     def text(self) -> str:
-        """The next text."""
         return self.sized("<I").decode("utf-8", "replace")
 
 
@@ -518,7 +491,6 @@ class Ros1Bag:
         topics: Collection[str] | None,
         lost: Report,
     ) -> Iterator[Record]:
-        """Reads all chunks, and fills `connections` from them."""
         end = os.fstat(file.fileno()).st_size
         file.seek(len(_ROS1_MAGIC))
         while (at := file.tell()) < end:
@@ -774,7 +746,6 @@ class DatabaseBag:
 
 
 def _log_of(path: Path) -> Path:
-    """The write-ahead log of a database."""
     return path.with_name(path.name + "-wal")
 
 
@@ -813,13 +784,7 @@ class Bag:
     """All files of a bag.
 
     Attributes:
-        path: as it was given.
-        topics: its topics by name.
         lost: what could not be read so far, without repetitions.
-
-    Raises:
-        SequenceError: a file cannot be read at all, or is no bag.
-        MissingExtraError: it is compressed, and the extra `bags` is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -878,11 +843,7 @@ class Bag:
 
 
 def files_of(path: Path) -> list[Path]:
-    """The files of a bag in order: the file itself, or those of a split bag by number.
-
-    Raises:
-        SequenceError: it is not a bag.
-    """
+    """The files of a bag in order: the file itself, or those of a split bag by number."""
     files = [path] if path.is_file() and _container(path) else _split_files(path)
     if not files:
         raise SequenceError(

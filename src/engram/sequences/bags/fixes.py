@@ -39,12 +39,7 @@ def read_fixes(path: Path, topic: str | None = None) -> list[Fix]:
     """The fixes of a bag, by rising time; messages without a fix are left out.
 
     Args:
-        path: the bag.
         topic: topic of the fixes; None if the bag has only one.
-
-    Raises:
-        InputError: there is no such topic, or more than one, or it holds no fix.
-        SequenceError: the bag cannot be read.
     """
     bag = Bag(path)
     known = fix_topics(bag)
@@ -69,14 +64,7 @@ def fix_topics(bag: Bag) -> list[str]:
 def fixes_of(
     bag: Bag, topic: str, decoder: Decoder, clock: SteadyClock | None = None
 ) -> Iterator[Fix]:
-    """The fixes of a topic by rising time; messages without a fix are left out.
-
-    Args:
-        bag: the bag.
-        topic: the topic.
-        decoder: decodes its messages.
-        clock: has the report on their stamps afterwards.
-    """
+    """The fixes of a topic by rising time; messages without a fix are left out."""
     for one in timed_messages(bag, decoder, topic, clock or SteadyClock(waits=True)):
         fix = _fix(one.item[0], one.time_ns)
         if fix is not None:

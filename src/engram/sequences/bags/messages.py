@@ -32,9 +32,6 @@ class Decoder:
 
     Args:
         is_ros1: whether they are serialised as in ROS 1, else as CDR.
-
-    Raises:
-        MissingExtraError: the extra `bags` is not installed.
     """
 
     def __init__(self, is_ros1: bool) -> None:
@@ -74,11 +71,6 @@ class Stamps:
 
     A single zero is a fault; only a topic whose first hundred stamps are all zero has none. The
     recorder's clock may be another: in simulation it is.
-
-    Args:
-        bag: the bag.
-        decoder: decodes its messages.
-        topic: the topic.
     """
 
     def __init__(self, bag: Bag, decoder: Decoder, topic: str) -> None:
@@ -210,12 +202,6 @@ def with_constant(static: Transforms, bag: Bag, decoder: Decoder, frame: str) ->
     """With the constant transforms of /tf, if the static ones do not lead to the robot's frame.
 
     A joint's, or those of robots that publish all transforms again and again.
-
-    Args:
-        static: the static transforms.
-        bag: the bag.
-        decoder: decodes its messages.
-        frame: the camera's.
     """
     topics = _named(bag, MOVING)
     if not frame or not topics or static.base_of(frame) is not None:
@@ -269,13 +255,7 @@ def read_infos(
     states the baseline.
 
     Args:
-        bag: the bag.
-        decoder: decodes its messages.
-        stereo: the image topics.
         size: of the images, px; None if unknown.
-
-    Raises:
-        CalibrationError: one is malformed.
     """
     topics = [name for name, one in bag.topics.items() if same_type(one.type) == _INFO]
     named = info_topics(stereo, topics)
@@ -323,14 +303,8 @@ def read_cameras(
     """The stereo pair as the bag describes it.
 
     Args:
-        bag: the bag.
-        decoder: decodes its messages.
-        stereo: the image topics.
         size: of the images, px.
         field_of_view_deg: of rectified images; None for the largest.
-
-    Raises:
-        CalibrationError: it does not, or what it says is not of a stereo pair.
     """
     if stereo.are_halves:
         raise CalibrationError(
@@ -407,7 +381,6 @@ def _stream_pose(bag: Bag, decoder: Decoder, image: str) -> SE3 | None:
 
 
 def _messages(bag: Bag, decoder: Decoder, topic: str, kind: str) -> Iterator[Any]:
-    """The messages of a topic that can be decoded; ends with the last one."""
     stated = bag.topics.get(topic)
     if stated is None or same_type(stated.type) != kind:
         return
@@ -487,17 +460,11 @@ class BagMotion:
     """The motion topics of a bag, and files given in addition.
 
     Args:
-        bag: the bag.
-        decoder: decodes its messages.
         names: topics or files: at most one of odometry and one of a gyroscope.
         transforms: static transforms, for the axes of the gyroscope.
-        cam_from_rig: mounting of the camera, if known.
 
     Attributes:
         clocks: of the topics' stamps, in the latest pass.
-
-    Raises:
-        SequenceError: a name is neither a topic with motion nor a file, or two are of a kind.
     """
 
     def __init__(

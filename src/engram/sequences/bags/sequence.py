@@ -68,9 +68,7 @@ class Shot(Generic[T]):
 
     Attributes:
         number: its place on the topic, from 0.
-        stamp_ns: capture time, ns.
         received_ns: when the recorder received it, ns.
-        content: the image, however it is stored.
     """
 
     number: int
@@ -84,14 +82,9 @@ class Pairing:
     """Outcome of pairing the images in a pass through the bag.
 
     Attributes:
-        tolerance_ns: largest offset of a pair.
-        left, right: images met on each topic.
-        paired: pairs of one instant.
-        largest_offset_ns: largest offset among them.
         unusable: images that could not be decoded or do not fit.
         placed: left images that have a time, and so a right one or none.
         complete: whether the pass reached the end of the bag; if not, some images still waited.
-        clocks: of the left and of the right stamps.
     """
 
     tolerance_ns: int
@@ -130,13 +123,6 @@ def learnt_tolerance(left_ns: Sequence[int], right_ns: Sequence[int], most_ns: i
 
     Three times the offset that 95 % of the images stay below, but less than half of the interval
     between images.
-
-    Args:
-        left_ns, right_ns: stamps of the first images of each topic.
-        most_ns: the largest that may be learnt.
-
-    Raises:
-        SequenceError: no images of the two topics are of one instant.
     """
     left, right = np.sort(np.array(left_ns, np.int64)), np.sort(np.array(right_ns, np.int64))
     after = np.searchsorted(right, left).clip(1, max(len(right) - 1, 1))
@@ -163,10 +149,6 @@ def pairs_of(
     """Each left image that has a time, with the right one of its instant.
 
     Both topics are read side by side, so that memory stays flat whatever the order of the bag.
-
-    Args:
-        left, right: the images of each topic.
-        pairing: counts what becomes of them.
     """
     timed = [
         in_time(shots, lambda one: one.stamp_ns, clock, lambda one: one.received_ns)
@@ -206,18 +188,7 @@ class BagSequence:
     `engram.sequences.clocks`: that of the left image, unless the clock was set back before.
 
     Attributes:
-        info: what is known of the drive as a whole.
-        cameras: its stereo pair, with the rectification of raw images.
-        camera: its one camera, rectified.
-        topics: where the images come from.
-        transforms: the constant transforms that were found.
         pairing: outcome of pairing the images, in the latest pass.
-
-    Raises:
-        SequenceError: the file cannot be read, or has no stereo pair of one instant.
-        CalibrationError: the calibration is missing, malformed, or does not fit.
-        MissingExtraError: the extra `bags` is not installed.
-        ConfigError: an option does not fit the bag.
     """
 
     def __init__(self, path: Path, options: OpenOptions) -> None:
@@ -353,12 +324,7 @@ class BagSequence:
         return len(self._options.frames.indices(min(count or 0 for count in counts)))
 
     def __iter__(self) -> Iterator[StereoPair]:
-        """Decodes one pair at a time.
-
-        Raises:
-            SequenceError: no pair can be used.
-            ConfigError: one colour channel is requested and the images are grey.
-        """
+        """Decodes one pair at a time."""
         self.pairing = Pairing(self.pairing.tolerance_ns)
         self._reasons.clear()
         frames, times, used = self._options.frames, self._options.times, 0
@@ -414,12 +380,6 @@ class BagSequence:
     def _shots(
         self, topic: str, damaged: Callable[[str], None] = lambda _: None
     ) -> Iterator[Shot[Any]]:
-        """The images of a topic, decoded to messages but not to pixels.
-
-        Args:
-            topic: the topic.
-            damaged: called with why an image cannot be read.
-        """
         kind = self._bag.topics[topic].type
         if topic not in self._stamps:
             self._stamps[topic] = Stamps(self._bag, self._decoder, topic)
@@ -518,11 +478,6 @@ class BagSequence:
         return read_cameras(self._bag, self._decoder, self.topics, self._size(), view)
 
     def _size(self) -> tuple[int, int]:
-        """Size of the first left image that can be read, px.
-
-        Raises:
-            SequenceError: there is none.
-        """
         topics = self._stereo_topics(None)
         width, height = self._first_size(topics.left)
         return (width // 2, height) if topics.are_halves else (width, height)
@@ -571,10 +526,7 @@ class TopicFacts:
     """One topic.
 
     Attributes:
-        name, type: of the topic.
-        messages: how many it has.
         rate_hz: usual rate; 0 for fewer than two messages.
-        size_bytes: of all its messages.
         gaps: intervals of more than three times the usual one.
         longest_gap_s: the longest of them; 0 if there is none.
     """
@@ -593,21 +545,13 @@ class BagFacts:
     """What a bag holds.
 
     Attributes:
-        path: as given.
-        files: number of files.
-        size_bytes: of the files.
-        start_ns: when the first message was recorded.
-        duration_s: from the first to the last message.
-        topics: by name.
         transforms: static transforms, "parent → child".
         left, right: image topics of the stereo pair; None if they are not found.
         question: why the pair or its calibration is not found; "" if it is.
         calibration: what was found of the pair's calibration, in a line.
         mounting: frame of the robot that the camera's mounting refers to, or "calibration" if
             the given one states it; None if unknown.
-        command: the command that maps the bag.
         notes: what was read otherwise than it is written.
-        lost: what could not be read.
         stamps: what is wrong with the stamps of images, motion and fixes, for people.
         faulty_share: share of the left images that are left out for a wrong stamp.
     """
@@ -632,16 +576,7 @@ class BagFacts:
 
 
 def describe_bag(path: Path, options: OpenOptions | None = None) -> BagFacts:
-    """Reads a bag's topics, calibration and transforms.
-
-    Args:
-        path: file or folder.
-        options: how it would be opened.
-
-    Raises:
-        SequenceError: it cannot be read.
-        MissingExtraError: the extra `bags` is not installed.
-    """
+    """Reads a bag's topics, calibration and transforms."""
     options = options or OpenOptions()
     bag = Bag(path)
     topics, start_ns, end_ns = _topics(bag)
@@ -669,7 +604,6 @@ def describe_bag(path: Path, options: OpenOptions | None = None) -> BagFacts:
 
 
 def _topics(bag: Bag) -> tuple[list[TopicFacts], int, int]:
-    """Facts of all topics; stamps of the first and the last message, ns."""
     stamps: dict[str, list[int]] = {name: [] for name in bag.topics}
     sizes = dict.fromkeys(bag.topics, 0)
     for record in bag.records():

@@ -89,14 +89,8 @@ def grey_of(
 
     Args:
         message: `sensor_msgs/Image` or `CompressedImage`.
-        where: topic and place, for messages.
         size: required width and height, px; None for any.
-        channel: of colour images.
         bits: that are used of 16-bit images; brighter pixels are white.
-
-    Raises:
-        SequenceError: its encoding is unknown, or its bytes do not fit.
-        ConfigError: one colour channel is requested and the image is grey.
     """
     image = _pixels(message, where, size)
     if bits < 16 and image.dtype == np.uint16:
@@ -124,11 +118,7 @@ def depth_of(messages: Iterable[Any], where: str) -> int:
 
 
 def size_of(message: Any, where: str) -> tuple[int, int]:
-    """Width and height of an image message, px.
-
-    Raises:
-        SequenceError: it cannot be decoded.
-    """
+    """Width and height of an image message, px."""
     if hasattr(message, "format"):
         height, width = decoded(where, bytes(message.data)).shape[:2]
         return width, height
@@ -288,14 +278,10 @@ def stereo_topics(
     """The image topics of a bag's stereo pair.
 
     Args:
-        topics: all topics.
         left, right: what the caller named; None finds it. One topic named twice has both sides in
             each image.
         prefer_raw: whether of one camera's topics the raw one is wanted, which the caller's
             calibration describes.
-
-    Raises:
-        SequenceError: a named topic has no images, or there is no pair, or more than one.
     """
     images = image_topics(topics)
     for option, name in (("--left", left), ("--right", right)):
@@ -323,7 +309,6 @@ def only_topic(topics: Mapping[str, Topic]) -> str | None:
 
 
 def _no_pair(images: Collection[str]) -> str:
-    """Why there is no pair, and what to do."""
     pictures = [name for name in images if not _NOT_PICTURES.search(name)]
     if len(pictures) < 2:
         return "the images of one camera only, and Engram needs both of a stereo camera"
@@ -403,7 +388,6 @@ def info_topics(stereo: StereoTopics, infos: Collection[str]) -> StereoTopics | 
     They are next to the images or above them, are named as the images are, or are the only two.
 
     Args:
-        stereo: the image topics.
         infos: the topics with `CameraInfo`.
     """
     beside = [_info_beside(image, infos) for image in (stereo.left, stereo.right)]
@@ -416,7 +400,6 @@ def info_topics(stereo: StereoTopics, infos: Collection[str]) -> StereoTopics | 
 
 
 def _shared(one: str, other: str) -> int:
-    """Number of letters that two names begin with alike."""
     pairs = enumerate(zip(one, other, strict=False))
     return next((at for at, (a, b) in pairs if a != b), min(len(one), len(other)))
 

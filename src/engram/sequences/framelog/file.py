@@ -185,8 +185,6 @@ class FrameLogHeader:
 
     Attributes:
         info: facts of the drive; `format` names the layout of its images.
-        camera: the camera of all frames.
-        descriptor: the kind of all descriptors.
         frontend: hash of the front-end's version and configuration.
         odometry: hash of the odometry's version and configuration.
         frames: which frames of the source were recorded, `str` of a `FrameRange`.
@@ -229,12 +227,7 @@ class FrameLogHeader:
 
     @staticmethod
     def from_json(text: str) -> FrameLogHeader:
-        """Undo `to_json`.
-
-        Raises:
-            MapCorruptError: the text is not a valid header.
-            IncompatibleError: its kind of descriptor is unknown here.
-        """
+        """Undo `to_json`."""
         try:
             values = json.loads(text)
             camera = _camera(values["camera"])
@@ -312,9 +305,6 @@ class StepRow:
     """A row without its blobs.
 
     Attributes:
-        number: place in the log.
-        stamp_ns: stamp of the frame.
-        status: status of the frame.
         pair_hash: `first_pair_hash` of the frame's images.
         odometry: ``prev_from_curr`` since the frame before, with its covariance.
     """
@@ -327,11 +317,7 @@ class StepRow:
 
 
 def encode_row(number: int, logged: LoggedFrame, pair_hash: str) -> dict[str, Any]:
-    """The row of a frame.
-
-    Raises:
-        InputError: the landmarks or the thumbnail cannot be stored without loss.
-    """
+    """The row of a frame."""
     frame, step = logged.frame, logged.odometry
     thumbnail = None
     if frame.thumbnail is not None:
@@ -356,11 +342,7 @@ def encode_row(number: int, logged: LoggedFrame, pair_hash: str) -> dict[str, An
 
 
 def decode_step(row: Any) -> StepRow:
-    """A row selected by `STEP_COLUMNS`.
-
-    Raises:
-        MapCorruptError: the columns do not match their digest, or hold impossible values.
-    """
+    """A row selected by `STEP_COLUMNS`."""
     columns = dict(row._mapping)
     where = f"frame {columns['number']}"
     for name, kinds in _COLUMN_KINDS.items():
@@ -382,11 +364,7 @@ def decode_step(row: Any) -> StepRow:
 def decode_frame(
     step: StepRow, landmarks: bytes, thumbnail: bytes | None, header: FrameLogHeader
 ) -> Frame:
-    """The frame of a row.
-
-    Raises:
-        MapCorruptError: a blob does not match its hash or holds impossible values.
-    """
+    """The frame of a row."""
     try:
         picture = None if thumbnail is None else decode_thumbnail(_checked(thumbnail))
         return Frame(

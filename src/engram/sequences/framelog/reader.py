@@ -45,11 +45,7 @@ def is_framelog(path: Path) -> bool:
 
 
 def open_framelog(path: Path, options: OpenOptions) -> FrameLog:
-    """A frame log as a drive; `FrameLog` lists other errors.
-
-    Raises:
-        ConfigError: an option for images is given.
-    """
+    """A frame log as a drive; `FrameLog` lists other errors."""
     if options.channel is not Channel.GREY:
         raise ConfigError(
             f"{path}: a frame log has no images to take channel {options.channel.value!r} of; "
@@ -71,12 +67,6 @@ class FrameLog:
     With a range of frames, odometry is composed over the frames left out; if one of those steps
     failed, the composed step fails too. With `skip_bad`, damaged frames are left out, too, and
     counted.
-
-    Raises:
-        SequenceError: the file is not a frame log, or no frame of it is chosen.
-        FormatVersionError: written by a newer Engram.
-        MapCorruptError: damaged or cut short.
-        ConfigError: a start time is given for a log whose clock is UTC already.
     """
 
     def __init__(self, path: str | Path, options: OpenOptions | None = None) -> None:
@@ -140,11 +130,7 @@ class FrameLog:
         return self._header.camera
 
     def motion(self) -> MotionSource | None:
-        """A new pass through the motion of the caller's files; None without one.
-
-        Raises:
-            SequenceError: a file cannot be used.
-        """
+        """A new pass through the motion of the caller's files; None without one."""
         return motion_of_files(self._motion_files, self.camera.cam_from_rig, self._shift_ns)
 
     @property
@@ -186,12 +172,7 @@ class FrameLog:
         return len(self._numbers)
 
     def __iter__(self) -> Iterator[LoggedFrame]:
-        """The chosen frames in the order of time.
-
-        Raises:
-            MapCorruptError: a frame's bytes do not match their hash, and `skip_bad` is not
-                set.
-        """
+        """The chosen frames in the order of time."""
         self._skipped_reasons.clear()
         previous: int | None = None
         for number in self._numbers:
@@ -207,11 +188,7 @@ class FrameLog:
             yield logged
 
     def read(self, index: int) -> LoggedFrame:
-        """Frame `index` of `len(self)`, with the motion since the chosen frame before it.
-
-        Raises:
-            MapCorruptError: its bytes do not match their hash.
-        """
+        """Frame `index` of `len(self)`, with the motion since the chosen frame before it."""
         index = range(len(self._numbers))[index]
         usable = (number for number in self._numbers[:index][::-1] if self._usable[number])
         return self._read(self._numbers[index], next(usable, None))
@@ -255,7 +232,6 @@ class FrameLog:
         return compose(composed, last.odometry)
 
     def _steps(self, connection: Connection, first: int, last: int) -> Iterator[StepRow]:
-        """The rows `first` to `last`, both included, without their blobs."""
         query = (
             select(*STEP_COLUMNS)
             .where(frames_table.c.number.between(first, last))
@@ -296,11 +272,7 @@ def compose(first: OdometryStep | None, second: OdometryStep) -> OdometryStep:
 
 
 def read_header(connection: Connection) -> tuple[FrameLogHeader, int]:
-    """Header of a log, and its number of frames: 0 before it is complete.
-
-    Raises:
-        MapCorruptError: it is missing or does not match its hash.
-    """
+    """Header of a log, and its number of frames: 0 before it is complete."""
     rows = connection.execute(select(log_table).order_by(log_table.c.key)).all()
     if (
         len(rows) != 1

@@ -47,16 +47,8 @@ class FrameLogWriter:
     `last_stamp_ns`.
 
     Args:
-        path: the file, created if missing.
-        header: facts common to all frames.
         checkpoint_every: frames between commits. 50: commits cost under 1 % of the
             front-end's time, and at most 5 s of a 10 Hz drive are lost.
-
-    Raises:
-        IncompatibleError: the file holds another drive's log, or one made with other settings.
-        InputError: the file is not a frame log, or its folder does not exist.
-        MapLockedError: another writer has it open.
-        MapError: as `FrameLog`, and `StorageFullError`.
     """
 
     def __init__(
@@ -98,10 +90,6 @@ class FrameLogWriter:
             logged: the frame, of the header's camera, front-end and descriptor kind.
             pair_hash: `first_pair_hash` of its images, for the identity of sessions that begin
                 with this frame.
-
-        Raises:
-            InputError: the frame is not after the last one, or does not fit the header.
-            StorageFullError: no space is left.
         """
         frame, header = logged.frame, self._header
         for name in ("camera", "descriptor", "frontend"):
@@ -122,12 +110,7 @@ class FrameLogWriter:
             self.checkpoint()
 
     def holds(self, stamp_ns: int, pair_hash: str) -> bool:
-        """Whether an earlier run recorded this frame, so that it is skipped.
-
-        Raises:
-            IncompatibleError: other images are recorded at its place: the log is that of another
-                drive, rig, channel or choice of frames.
-        """
+        """Whether an earlier run recorded this frame, so that it is skipped."""
         if self._last_stamp_ns is None or stamp_ns > self._last_stamp_ns:
             return False
         with self._or_abandon() as connection:
@@ -260,7 +243,6 @@ class FlightWriter(FrameLogWriter):
         """Stores why and where the record was made.
 
         Args:
-            content: plain JSON data.
             frames, images: how many frames, and of how many the images, will be added: so that a
                 reader finds out what is gone.
         """
@@ -288,12 +270,7 @@ class FlightWriter(FrameLogWriter):
 
 
 def read_report(path: Path) -> dict[str, Any]:
-    """Why and where a record was made.
-
-    Raises:
-        SequenceError: the file is not a flight record.
-        MapCorruptError: it is damaged.
-    """
+    """Why and where a record was made."""
     with _reading(path) as connection:
         return _report(path, connection)
 
@@ -308,12 +285,7 @@ def read_decisions(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def read_images(path: Path, number: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
-    """Left and right image (h, w) uint8 of a frame; None if the record has none.
-
-    Raises:
-        SequenceError: the file is not a flight record.
-        MapCorruptError: it is damaged.
-    """
+    """Left and right image (h, w) uint8 of a frame; None if the record has none."""
     with _reading(path) as connection:
         columns = images_table.c
         query = select(images_table).where(columns.number == number).order_by(columns.number)
@@ -350,11 +322,6 @@ def _reading(path: Path) -> Iterator[Connection]:
 
 
 def _report(path: Path, connection: Connection) -> dict[str, Any]:
-    """The report of a record, which has one.
-
-    Raises:
-        MapCorruptError: it has none, or it is damaged.
-    """
     row = connection.execute(select(report_table).order_by(report_table.c.key)).first()
     if row is None:
         raise MapCorruptError(f"{path}: the flight record has lost its report")
@@ -362,11 +329,7 @@ def _report(path: Path, connection: Connection) -> dict[str, Any]:
 
 
 def _check_count(path: Path, stored: int, report: Mapping[str, Any], name: str) -> None:
-    """Compares the rows that are stored with those that the report counts.
-
-    Raises:
-        MapCorruptError: they differ. Records of before Engram counted them are not compared.
-    """
+    """Compares the rows that are stored with those that the report counts."""
     counted = report.get(name, stored)
     if stored != counted:
         raise MapCorruptError(
@@ -375,11 +338,6 @@ def _check_count(path: Path, stored: int, report: Mapping[str, Any], name: str) 
 
 
 def _json(path: Path, row: Any) -> dict[str, Any]:
-    """The content of a row.
-
-    Raises:
-        MapCorruptError: it does not match its hash, or is not an object.
-    """
     try:
         if content_digest(row.content.encode()) != row.digest:
             raise ValueError("does not match its hash")
