@@ -1,8 +1,7 @@
-"""What six planted faults would change (`engram_lab.checks.planted_faults`)."""
+"""Values that a study rests on: each test fails if one of them is off."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,11 +21,8 @@ from engram.robot.settings import RobotOptions, Settings
 from engram.sequences.opening import open_drive
 from engram.testing.contracts import make_context
 from engram_lab import trial
-from engram_lab.checks.planted_faults import FAULTS, planted
 from engram_lab.studies.fleet.results import Parallel, Time
 from engram_lab.studies.fleet.steps import _united
-
-ROOT = Path(__file__).parents[2]
 
 
 def test_path_near_ranks_by_paths_only_where_six_in_ten_would_match():
@@ -94,12 +90,3 @@ def test_united_counts_own_nodes_and_what_was_sent_once():
     nodes = [SimpleNamespace(session=own)] * 4 + [SimpleNamespace(session=other)] * 3
     sent = SimpleNamespace(nodes=nodes[3:6])  # one own, two of another
     assert _united(sent, nodes, {own}) == 4 + 2
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_the_place_of_each_fault_is_still_there(name):
-    """The program that plants them finds its text; it runs the tests itself, in minutes."""
-    fault = FAULTS[name]
-    text = (ROOT / fault.file).read_text(encoding="utf-8")
-    assert text.count(fault.right) == 1
-    assert planted(text, fault) != text
