@@ -1,0 +1,450 @@
+"""How the product grows with its map: cities of any size, and what a robot takes in them.
+
+    engram lab evaluate scale --sizes 5000,20000,100000
+
+A city is made of streets of 500 m, each driven five times: 2,500 nodes, 7.8 edges a node (odometry,
+matches and proximity edges between the drives), 2.4 path entries and 46 attempts a node, one
+revision a street. Its rows are written straight into the tables, since the product would take hours
+over 10⁶ nodes. Only the streets around the one that is driven have landmarks that differ from
+place to place.
+
+Every measurement runs in a process of its own, a fork of one that has imported everything and read
+the vocabulary. Times are of the processor.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import sqlite3
+import time
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from sqlalchemy import Table
+
+from engram import __version__
+from engram.frontend.blobs import blob_hash, decode_landmarks
+from engram.frontend.frame import Frame, FrameStatus
+from engram.geometry.se3 import SE3
+from engram.graph.model import EdgeKind, Node, PathEntryKind, Session, path_id
+from engram.graph.paths import Attempts
+from engram.graph.placing import MAP_FROM_CAMERA
+from engram.localiser.localisation import Position
+from engram.maps import schema
+from engram.maps.attempts import encode_words, pack
+from engram.maps.map import Map
+from engram.maps.rows import camera_row, covariance_bytes, session_row, to_json, transform_bytes
+from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.places.vocabulary import Vocabulary, default_vocabulary, hash_of
+from engram.sequences.sequence import LoggedFrame
+from engram_lab.synthetic_places import (
+    CAMERA,
+    DESCRIPTOR,
+    FRONTEND,
+    drive_of,
+    landmark_bytes,
+    node_of,
+)
+
+LANES = 5
+LANDMARKS, FAR_LANDMARKS = 100, 12
+BEGIN = 20  # the metre of the driven street at which the robot begins
+STEPS = 200
+_TRIED = 46  # attempts of a drive per metre
+_PERIOD_NS = 100_000_000
+_FIRST_NS = 1_600_000_000_000_000_000
+_STEP_SIGMA = np.diag([0.01**2] * 3 + [0.002**2] * 3)
+_MATCH_SIGMA = np.diag([0.02**2] * 3 + [0.004**2] * 3)
+_STEP, _MATCH = covariance_bytes(_STEP_SIGMA), covariance_bytes(_MATCH_SIGMA)
+
+
+@dataclass(frozen=True, slots=True)
+class City:
+    """Streets that turn right and left in turn; the robot drives along the one in the middle.
+
+    Attributes:
+        streets: how many.
+        length: of each, in metres.
+    """
+
+    streets: int
+    length: int = 500
+
+    @staticmethod
+    def of(nodes: int) -> City:
+        """A city of so many nodes, rounded down to whole streets, at least three."""
+        return City(max(nodes // City(1).nodes, 3))
+
+    @property
+    def nodes(self) -> int:
+        """Number of its nodes."""
+        return self.streets * LANES * self.length
+
+    @property
+    def driven(self) -> int:
+        """The street on which the robot drives."""
+        return self.streets // 2
+
+    def drive(self, street: int, lane: int) -> Session:
+        """The drive along a lane of a street."""
+        start_ns = _FIRST_NS + (street * LANES + lane) * 3_600_000_000_000
+        return drive_of("fleet", start_ns, f"{street}-{lane}")
+
+    def node(self, street: int, lane: int, metre: int) -> Node:
+        """The node at a metre of a drive."""
+        made = self.drive(street, lane)
+        return node_of(made, made.start_ns + metre * _PERIOD_NS, float(metre))
+
+    def pose(self, street: int, lane: int, metre: int) -> SE3:
+        """Of a node's camera; lanes are half a metre apart."""
+        ahead = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+        turn = ahead if street % 2 else np.eye(3)
+        begin = self.length * np.array([street // 2, 0.0, (street + 1) // 2])
+        return SE3(turn, begin + turn @ np.array([0.5 * (lane - LANES // 2), 0.0, float(metre)]))
+
+    def seed(self, street: int, metre: int) -> int:
+        """Draws the landmarks at a metre of a street near the driven one."""
+        return street * self.length + metre
+
+    def frame(self, metre: int) -> LoggedFrame:
+        """What a live camera sees at a metre of the driven street, from metre `BEGIN` on."""
+        place = np.random.default_rng((self.seed(self.driven, metre), 0))
+        blob = landmark_bytes(place, np.random.default_rng((metre, 7)), LANDMARKS)
+        landmarks = decode_landmarks(blob, CAMERA, DESCRIPTOR)
+        stamp_ns = 2 * _FIRST_NS + metre * _PERIOD_NS
+        frame = Frame(stamp_ns, CAMERA, landmarks, DESCRIPTOR, FRONTEND, FrameStatus.OK)
+        return LoggedFrame(frame, _AHEAD if metre > BEGIN else OdometryStep(OdometryStatus.FIRST))
+
+    def write(self, path: Path) -> None:
+        """Writes its map."""
+        Map.create(path).close()
+        with closing(sqlite3.connect(path)) as database:
+            database.execute("PRAGMA synchronous=off")
+            database.execute("PRAGMA cache_size=-200000")
+            rows = _Rows(self, database)
+            for street in range(self.streets):
+                rows.write_street(street)
+                if street % 10 == 9:
+                    database.commit()
+            rows.index()
+            database.commit()
+            database.execute("PRAGMA wal_checkpoint(truncate)")
+
+
+_AHEAD = OdometryStep(
+    OdometryStatus.OK, SE3(np.eye(3), np.array([0.0, 0.0, 1.0])), _STEP_SIGMA, LANDMARKS
+)
+_encode = msgspec.msgpack.Encoder().encode
+
+
+class _Rows:
+    """Rows of a city, written street after street."""
+
+    def __init__(self, city: City, database: sqlite3.Connection) -> None:
+        self._city, self._database = city, database
+        self._rng = np.random.default_rng(1)
+        self._keys = dict.fromkeys(schema.KEYED, 0)
+        self._tried = [_attempts(self._rng, city.length) for _ in range(3)]
+        self._between = cache(self._between_uncached)
+        self._rows: dict[Table, list[tuple[Any, ...]]] = {}
+        self._put(schema.cameras, **camera_row(CAMERA, self._next(schema.cameras)))
+        one = {"key": 1, "descriptor": str(DESCRIPTOR), "hash": FRONTEND}
+        self._put(schema.frontends, **one)
+        self._write()
+
+    def write_street(self, street: int) -> None:
+        """Writes a street as one revision."""
+        city, revision = self._city, street + 1
+        first = self._keys[schema.nodes] + 1
+        for lane in range(LANES):
+            self._write_drive(revision, street, lane, first)
+        if street:
+            for lane in range(LANES):
+                begin = first + lane * city.length
+                last = begin - LANES * city.length + city.length - 1
+                before = city.pose(street - 1, lane, city.length - 1)
+                between = transform_bytes(before.inverse() @ city.pose(street, lane, 0))
+                self._edge(revision, last, begin, EdgeKind.MATCH, between, _MATCH)
+        contents: dict[str, float] = dict.fromkeys((one.name for one in schema.VERSIONED), 0)
+        contents |= {
+            one.name: len(rows) for one, rows in self._rows.items() if one.name in contents
+        }
+        tried = LANES * _TRIED * city.length
+        contents |= {"attempts": tried, "mapped_m": LANES * (city.length - 1.0)}
+        self._put(
+            schema.revisions,
+            key=revision,
+            number=revision,
+            status="committed",
+            parent=revision - 1 or None,
+            author="city",
+            message=f"street {street}",
+            tool_version=__version__,
+            configuration="{}",
+            contents=to_json(contents),
+            opened_ns=_FIRST_NS + 2 * street,
+            committed_ns=_FIRST_NS + 2 * street + 1,
+            host="",
+            pid=1,
+            writer="",
+        )
+        self._write()
+
+    def index(self) -> None:
+        """Adds the indices that a map by pages is read with, where its format has none."""
+        for table, column in (("edges", "b"), ("path_entries", "node"), ("nodes", "session")):
+            indexed = (
+                found[0]
+                for (name,) in self._database.execute(
+                    "SELECT name FROM sqlite_schema WHERE type = 'index' AND tbl_name = ?", (table,)
+                ).fetchall()
+                for found in self._database.execute(
+                    "SELECT name FROM pragma_index_info(?) WHERE seqno = 0", (name,)
+                ).fetchall()
+            )
+            if column not in indexed:
+                name = f"{table}_by_{column}"
+                self._database.execute(f"CREATE INDEX {name} ON {table} ({column})")
+
+    def _write_drive(self, revision: int, street: int, lane: int, first: int) -> None:
+        made, length = self._city.drive(street, lane), self._city.length
+        session, path = self._next(schema.sessions), self._next(schema.paths)
+        self._put(schema.sessions, **session_row(made, session, revision, 1, 1))
+        named = {"key": path, "uuid": path_id(made.id).bytes, "revision": revision}
+        self._put(schema.paths, **named, session=session, partial=0)
+        sequence = 0
+        for metre in range(length):
+            key = self._node(revision, session, street, lane, metre)
+            if metre:
+                step = self._between(street % 2, lane, metre - 1, lane, metre)
+                self._edge(revision, key - 1, key, EdgeKind.ODOMETRY, step, _STEP)
+            for there in range(metre - 4, metre + 5) if lane else ():
+                if 0 <= there < length:
+                    other = int(self._rng.integers(0, lane))
+                    kind = EdgeKind.MATCH if (there - metre) % 2 else EdgeKind.PROXIMITY
+                    between = self._between(street % 2, other, there, lane, metre)
+                    self._edge(revision, first + other * length + there, key, kind, between, _MATCH)
+            matched = [first + int(other) * length + metre for other in self._rng.permutation(lane)]
+            kinds = [PathEntryKind.SAVED, *[PathEntryKind.MATCHED] * len(matched[:2])]
+            for taken, entry in zip(kinds, [key, *matched[:2]], strict=True):
+                self._put(
+                    schema.path_entries,
+                    key=self._next(schema.path_entries),
+                    revision=revision,
+                    path=path,
+                    sequence=sequence,
+                    node=entry,
+                    kind=str(taken),
+                    stamp_ns=made.start_ns + metre * _PERIOD_NS,
+                )
+                sequence += 1
+        tried = self._tried[lane % len(self._tried)]
+        moved = replace(tried, reference=tried.reference + first, node=tried.node + first)
+        for count, body in pack(moved):
+            row = {"key": self._next(schema.attempts), "revision": revision, "session": session}
+            self._put(schema.attempts, **row, count=count, body=body)
+
+    def _node(self, revision: int, session: int, street: int, lane: int, metre: int) -> int:
+        city = self._city
+        made, key = city.node(street, lane, metre), self._next(schema.nodes)
+        near = abs(street - city.driven) <= 1
+        blob, digest, words = _place(city.seed(street, metre) if near else -(metre % 64) - 1)
+        self._put(
+            schema.nodes,
+            key=key,
+            uuid=made.id.bytes,
+            revision=revision,
+            session=session,
+            camera=1,
+            frontend=1,
+            stamp_ns=made.stamp_ns,
+            driven_m=made.driven_m,
+            status=str(FrameStatus.OK),
+            landmark_hash=digest,
+        )
+        self._put(schema.frames, node=key, revision=revision, landmarks=blob, thumbnail=None)
+        self._put(schema.words, node=key, vocabulary=hash_of(_vocabulary()), body=words)
+        placed = {"key": self._next(schema.placements), "revision": revision, "node": key}
+        pose = SE3(MAP_FROM_CAMERA.copy(), np.zeros(3)) @ city.pose(street, lane, metre)
+        self._put(schema.placements, **placed, map_from_node=transform_bytes(pose))
+        return key
+
+    def _between_uncached(self, turned: int, lane_a: int, a: int, lane_b: int, b: int) -> bytes:
+        city = self._city
+        return transform_bytes(
+            city.pose(turned, lane_a, a).inverse() @ city.pose(turned, lane_b, b)
+        )
+
+    def _edge(
+        self, revision: int, a: int, b: int, kind: EdgeKind, a_from_b: bytes, covariance: bytes
+    ) -> None:
+        self._put(
+            schema.edges,
+            key=self._next(schema.edges),
+            revision=revision,
+            a=a,
+            b=b,
+            kind=str(kind),
+            a_from_b=a_from_b,
+            covariance=covariance,
+        )
+
+    def _next(self, table: Table) -> int:
+        self._keys[table] += 1
+        return self._keys[table]
+
+    def _put(self, table: Table, **values: Any) -> None:
+        row = [values[name] for name in _columns(table)]
+        self._rows.setdefault(table, []).append((*row, zlib.crc32(_encode(row))))
+
+    def _write(self) -> None:
+        for table, rows in self._rows.items():
+            places = ",".join("?" * len(rows[0]))
+            self._database.executemany(f"INSERT INTO {table.name} VALUES ({places})", rows)
+        self._rows.clear()
+
+
+@cache
+def _columns(table: Table) -> tuple[str, ...]:
+    return tuple(column.name for column in table.columns)[:-1]
+
+
+@cache
+def _vocabulary() -> Vocabulary:
+    return default_vocabulary(DESCRIPTOR)
+
+
+@cache
+def _place(seed: int) -> tuple[bytes, bytes, bytes]:
+    """Landmarks, their hash and words of a place; a negative seed draws one of the far streets."""
+    count = LANDMARKS if seed >= 0 else FAR_LANDMARKS
+    blob = landmark_bytes(np.random.default_rng((abs(seed), int(seed < 0))), None, count)
+    landmarks = decode_landmarks(blob, CAMERA, DESCRIPTOR)
+    words = _vocabulary().words_of(landmarks.descriptors, DESCRIPTOR)
+    return blob, blob_hash(blob), encode_words(words)
+
+
+def _attempts(rng: np.random.Generator, length: int) -> Attempts:
+    """Attempts of a drive at nodes of its street, by number within the street."""
+    count = _TRIED * length
+    metre = np.sort(rng.integers(4, length - 4, count))
+    lanes, off = rng.integers(0, LANES, (2, count)), rng.integers(-4, 5, count)
+    drawn = {
+        name: rng.uniform(-0.3, 0.3, count).astype(np.float32) for name in ("across_m", "yaw_rad")
+    } | {
+        name: rng.uniform(0.01, 0.5, count).astype(np.float32)
+        for name in ("sigma_m", "sigma_yaw_rad")
+    }
+    return Attempts(
+        session=np.zeros(count, np.int32),
+        iteration=metre.astype(np.int64),
+        reference=(lanes[0] * length + metre).astype(np.int64),
+        node=(lanes[1] * length + metre + off).astype(np.int64),
+        along_m=off.astype(np.float32),
+        **drawn,
+        accepted=rng.random(count) < np.exp(-np.abs(off) / 3),
+        inliers=rng.integers(0, 300, count).astype(np.int32),
+        rank=rng.integers(0, 20, count).astype(np.int32),
+        policy=np.zeros(count, np.int32),
+        policies=("recall",),
+    )
+
+
+# -- measurements: each takes a map and its city, and gives figures by name
+
+
+def drive_in(path: Path, city: City) -> dict[str, float]:
+    """Opens the map, places a robot on the driven street and lets it drive."""
+    frames = [city.frame(BEGIN + step) for step in range(min(STEPS, city.length - BEGIN))]
+    known = city.node(city.driven, 2, BEGIN)
+    before_mb, begun = resident_mb(), time.process_time()
+    with Map.open(path) as opened, opened.robot(CAMERA) as robot:
+        certain = np.diag([0.1**2] * 3 + [0.01**2] * 3)
+        robot.place_at(Position(known.id, SE3.identity(), certain))
+        taken, localised = [], 0
+        for frame in frames:
+            found = robot.step(frame)
+            taken.append(time.process_time() - begun)
+            localised += found.localised
+        steps_ms = 1e3 * np.diff(taken)
+        return {
+            "open and first step (s)": taken[0],
+            "step (ms)": float(np.median(steps_ms)),
+            "step, 99th percentile (ms)": float(np.percentile(steps_ms, 99)),
+            "memory (MB)": resident_mb() - before_mb,
+            "localised (%)": 100 * localised / len(frames),
+        }
+
+
+MEASURES: Mapping[str, Callable[[Path, City], dict[str, float]]] = {"robot": drive_in}
+
+
+def resident_mb() -> float:
+    """Resident memory of this process, MB."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * 4096 / 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Figures:
+    """What was measured in one city.
+
+    Attributes:
+        nodes: size of the city.
+        values: figures by name.
+    """
+
+    nodes: int
+    values: Mapping[str, float]
+
+
+def measure(
+    sizes: Iterable[int], folder: Path, measures: Iterable[str] = tuple(MEASURES)
+) -> Iterable[Figures]:
+    """Measures cities of these sizes; those that the folder holds already are taken as they are.
+
+    Args:
+        sizes: numbers of nodes, rounded down to whole streets.
+        folder: of the maps.
+        measures: keys of `MEASURES`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    _vocabulary()
+    for size in sizes:
+        city = City.of(size)
+        path = folder / f"city-{city.nodes}.engram"
+        if not path.exists():
+            draft = path.with_suffix(".draft.engram")
+            draft.unlink(missing_ok=True)
+            city.write(draft)
+            draft.rename(path)
+        values: dict[str, float] = {}
+        for name in measures:
+            values |= _in_a_child(name, path, city)
+        yield Figures(city.nodes, values)
+
+
+def _in_a_child(name: str, path: Path, city: City) -> dict[str, float]:
+    with multiprocessing.get_context("fork").Pool(1) as pool:
+        return pool.apply(MEASURES[name], (path, city))
+
+
+def table(found: Iterable[Figures]) -> str:
+    """The figures as a Markdown table, one column a city."""
+    found = list(found)
+    names = dict.fromkeys(name for one in found for name in one.values)
+    lines = [
+        "| | " + " | ".join(f"{one.nodes:,}" for one in found) + " |",
+        "| --- |" + " --- |" * len(found),
+    ]
+    for name in names:
+        cells = (f"{one.values[name]:.4g}" if name in one.values else "" for one in found)
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
