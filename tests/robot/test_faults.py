@@ -4,49 +4,36 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from engram.geometry.se3 import SE3
-from engram.sequences.opening import open_drive
-from engram_lab.checks.stalls import KITTI_06, KITTI_06_TRUTH, Clip, Tally, freezes, stalls
+from engram_lab.studies.faults.questions import disturbed, frozen_streams, stalled
+from engram_lab.studies.faults.study import RealPlan
+
+MAPS = pytest.mark.parametrize("mapped", [slice(None), slice(25)], ids=["whole", "half"])
 
 
-@pytest.fixture(scope="module", params=[None, "0:25"], ids=["whole", "half"])
-def clip(request, data_dir: Path, tmp_path_factory: pytest.TempPathFactory):
-    folder = data_dir / KITTI_06
-    pairs = list(open_drive(folder))
-    rows = np.loadtxt(data_dir / KITTI_06_TRUTH)[: len(pairs)]
-    truth = [SE3.from_matrix(row.reshape(3, 4)) for row in rows]
-    mapped = open_drive(folder, **({"frames": request.param} if request.param else {}))
-    path = tmp_path_factory.mktemp("faults") / "town.engram"
-    made = Clip(pairs, truth, path, mapped)
-    yield made, request.param is None
-    made.close()
+@pytest.fixture(scope="module")
+def clip(data_dir: Path):
+    return RealPlan("kitti-06", "whole", data_dir).read()
 
 
+@MAPS
 @pytest.mark.data
-def test_no_fix_after_a_stall_is_false(clip) -> None:
+def test_no_fix_after_a_stall_is_false(clip, mapped, tmp_path: Path) -> None:
     # The street repeats every 27.7 m: stalls of about that length are the worst.
-    found = stalls(clip[0], [(4, 36), (12, 36), (10, 18), (16, 40), (22, 45)])
-    assert found.false == 0
+    gaps = [(4, 36), (12, 36), (10, 18), (16, 40), (22, 45)]
+    found = disturbed(clip, mapped, tmp_path / "town.engram", stalled(clip, gaps))
+    assert (found.robots, found.false) == (5, 0)
     assert found.fixes > 50
-    if clip[1]:  # the map knows where the robot is; two frames tell a stall from a wrong stamp
+    if mapped == slice(None):  # two frames tell a stall from a wrong stamp
+        assert len(found.again) == 5
         assert all(one <= 2 for one in found.again)
 
 
+@MAPS
 @pytest.mark.data
-def test_no_fix_comes_from_images_that_are_repeated(clip) -> None:
-    found = freezes(clip[0], [12, 28])
+def test_no_fix_comes_from_images_that_are_repeated(clip, mapped, tmp_path: Path) -> None:
+    found = disturbed(clip, mapped, tmp_path / "town.engram", frozen_streams(clip, [12, 28]))
     assert found.false == 0
-    if clip[1]:
-        assert len(found.again) == found.tries
-
-
-def test_a_tally_counts_tries_that_were_hurt_and_frames_until_found_again() -> None:
-    tally = Tally()
-    tally.count({0: 0.1, 1: 5.0, 3: 0.2}, range(4), after=2)
-    tally.count({0: 0.1}, range(4), after=2)
-    assert (tally.tries, tally.fixes, tally.false, tally.hurt) == (2, 4, 1, 1)
-    assert tally.worst_m == 5.0
-    assert tally.again == [1]
+    if mapped == slice(None):
+        assert len(found.again) == found.robots == 6

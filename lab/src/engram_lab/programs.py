@@ -25,6 +25,10 @@ class Figure:
     value: float
     unit: str = ""
 
+    def text(self) -> str:
+        """A line for people."""
+        return f"  {self.name:<60}{self.value:10.3f} {self.unit}"
+
 
 def command_line(about: str | None) -> argparse.ArgumentParser:
     """A parser that shows a module's docstring, and takes ``--json FILE``."""
@@ -41,7 +45,7 @@ def report(figures: Iterable[Figure], file: Path | None, title: str = "") -> Non
         print(f"\n{title}")
     kept = []
     for one in figures:
-        print(f"  {one.name:<60}{one.value:10.3f} {one.unit}", flush=True)
+        print(one.text(), flush=True)
         kept.append(asdict(one))
     if file is None:
         return

@@ -19,6 +19,7 @@ from engram.errors import ConfigError
 if TYPE_CHECKING:
     from engram.robot.settings import Settings
     from engram_lab.studies.drives import DriveSet
+    from engram_lab.studies.faults.table import Asked
 
 
 def numbers(text: str, option: str) -> tuple[int, ...]:
@@ -369,16 +370,48 @@ def _redone(redo: str | None, policies: tuple[str, ...], *, report_only: bool) -
 @evaluate.command("faults")
 def faults(
     *,
+    only: Annotated[
+        str | None,
+        typer.Option(
+            "--only",
+            metavar="NAME,NAME…",
+            help="Ask these questions, or inject these faults [default: all faults].",
+        ),
+    ] = None,
     trials: Annotated[
-        int, typer.Option("--trials", metavar="N", min=1, help="How many trials in all.")
-    ] = 1000,
+        int | None,
+        typer.Option(
+            "--trials", metavar="N", min=1, help="Trials in all; of a question see its text [1000]."
+        ),
+    ] = None,
+    towns: Annotated[
+        str | None, typer.Option("--towns", metavar="N,N…", help="Seeds of a question's towns.")
+    ] = None,
+    campaign: Annotated[
+        str, typer.Option("--campaign", metavar="NAME", help="Of a question: NAME or NAME@SEED.")
+    ] = "",
+    mapped: Annotated[
+        str | None, typer.Option("--mapped", metavar="N,N…", help="Drives that are mapped.")
+    ] = None,
+    live: Annotated[
+        str | None, typer.Option("--live", metavar="N,N…", help="Drives that are localised.")
+    ] = None,
+    features: Annotated[
+        str, typer.Option("--features", metavar="KIND", help="Of a question: brief or net.")
+    ] = "brief",
+    config: options.Settings = None,
+    changes: Annotated[
+        list[str], typer.Option("--set", metavar="KEY=VALUE", help="A setting of the robots.")
+    ] = [],  # noqa: B006
     report_only: Annotated[
         bool, typer.Option("--report-only", help="Report what was run before; run nothing.")
     ] = False,
     work: Annotated[
         Path | None,
         typer.Option(
-            "--work", metavar="FILE", help="File of the results [default: in the user's cache]."
+            "--work",
+            metavar="FILE",
+            help="File of the trials, folder of questions [default: in the user's cache].",
         ),
     ] = None,
     out: Annotated[
@@ -390,34 +423,94 @@ def faults(
 
     Localises clips (python -m engram_lab.studies.faults.clips renders them; ENGRAM_DATA names
     real ones) in maps of other days, and maps them on. The same command resumes a run that
-    was stopped; each version of the method has a file of its own.
+    was stopped; each version of the method has a file of its own. With --only a question is
+    asked instead: robots that are misplaced, maps that are merged, cameras that are mounted
+    otherwise. A wrong name lists the questions.
 
     \b
     Examples:
       engram lab evaluate faults --trials 100
+      engram lab evaluate faults --only stall,blackout --trials 100
+      engram lab evaluate faults --only hints --towns 407 --trials 1500
       engram lab evaluate faults --report-only --out faults.md
     """
+    from platformdirs import user_cache_path
+
+    from engram.cli.settings import read_settings
+    from engram_lab.studies.faults.questions import QUESTIONS
+    from engram_lab.studies.faults.staging import KINDS
+    from engram_lab.studies.faults.table import Asked
+    from engram_lab.studies.streets import HELD_OUT_TOWNS
+
+    names = only.split(",") if only else list(KINDS)
+    if wrong := [one for one in names if one not in {*KINDS, *QUESTIONS}]:
+        raise ConfigError(
+            f"--only {wrong[0]!r}: the questions are {', '.join(QUESTIONS)}; "
+            f"the faults are {', '.join(KINDS)}"
+        )
+    folder = user_cache_path("engram") / "faults"
+    asked = Asked(
+        settings=read_settings(config, changes).of_robot(features),
+        folder=work or folder,
+        towns=numbers(towns, "--towns") if towns else HELD_OUT_TOWNS,
+        campaign=campaign,
+        mapped=numbers(mapped, "--mapped") if mapped else (),
+        live=numbers(live, "--live") if live else (),
+        trials=trials,
+    )
+    questions = [one for one in names if one in QUESTIONS]
+    if questions:
+        _answer(questions, asked, as_json)
+    if injected := [one for one in names if one in KINDS]:
+        _inject(injected, trials or 1000, work, out, report_only=report_only, as_json=as_json)
+
+
+def _answer(names: list[str], asked: Asked, as_json: bool) -> None:
+    """Asks questions one after another."""
+    from dataclasses import asdict
+
+    from engram_lab.studies.faults.questions import QUESTIONS
+
+    answers = {}
+    for name in names:
+        found = []
+        if not as_json:
+            typer.echo(f"{name}: {(QUESTIONS[name].__doc__ or '').splitlines()[0]}")
+        for one in QUESTIONS[name](asked):
+            found.append(asdict(one))
+            if not as_json:
+                typer.echo(one.text())
+        answers[name] = found
+    if as_json:
+        print(json.dumps(answers))
+
+
+def _inject(
+    names: list[str], trials: int, work: Path | None, out: Path, *, report_only: bool, as_json: bool
+) -> None:
+    """Runs the trials of some faults that are missing, and reports."""
     from dataclasses import asdict
 
     from platformdirs import user_cache_path
 
     from engram.cli.screen import Bars
-    from engram_lab.studies.faults.staging import default_file, read_trials
+    from engram_lab.studies.faults.staging import default_file, fault_of, read_trials
     from engram_lab.studies.faults.study import headline, page, run
 
     file = work or default_file(user_cache_path("engram") / "faults")
     if not report_only:
-        left = trials - len(read_trials(file))
-        with Bars().stage("faults", max(left, 0)) as monitor:
-            for _ in run(file, trials, monitor=monitor):
+        wanted = [number for number in range(trials) if fault_of(number) in names]
+        made = {one.number for one in read_trials(file)}
+        with Bars().stage("faults", len(set(wanted) - made)) as monitor:
+            for _ in run(file, trials, monitor=monitor, only=names):
                 pass
-    made = read_trials(file)
+    found = [one for one in read_trials(file) if one.fault in names]
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(page(made), encoding="utf-8")
+    out.write_text(page(found), encoding="utf-8")
     if as_json:
-        print(json.dumps([asdict(one) for one in made]))
+        print(json.dumps([asdict(one) for one in found]))
     else:
-        typer.echo(f"{headline(made)}\n{out}")
+        typer.echo(f"{headline(found)}\n{out}")
 
 
 @evaluate.command("scale")

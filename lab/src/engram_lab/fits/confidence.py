@@ -6,8 +6,8 @@
 Robots drive in small towns by day and night: undisturbed, told a wrong place, carried elsewhere,
 past gaps, lost, and lost in another town. Each of their matches is a row: what was known of it, and
 whether it was right, within 1 m and 5°. Misplaced robots meet look-alikes too rarely to learn from,
-so all of them are searched for (`engram_lab.misplaced`) and added; the constants are corrected
-for their number. A logistic model is fitted for each reading of a match, and then a calibration of
+so all of them are searched for (`WrongPlaces`) and added; the constants are corrected for their
+number. A logistic model is fitted for each reading of a match, and then a calibration of
 what would be claimed of the matches that robots met. On the held-out towns, without those
 look-alikes, log loss is compared with that of a logistic in inliers alone, and bin by bin how many
 matches are wrong with how many would be by what is claimed. With `--shipped` the calibration is
@@ -44,42 +44,39 @@ from engram.localiser.confidence import (
 from engram.localiser.settings import METHOD_VERSION
 from engram.monitor import Monitor, write_whole
 from engram.robot.settings import Settings
-from engram_lab.misplaced import (
-    FALSE_M,
-    FALSE_RAD,
+from engram_lab.accuracy import SURE, is_false
+from engram_lab.programs import Figure, command_line, numbers, report
+from engram_lab.studies.streets import (
+    AT_NIGHT,
+    FITTED_TOWNS,
+    HELD_OUT_TOWNS,
     LEAST_INLIERS,
-    SURE,
+    STREETS,
     Kind,
     Looked,
     Street,
     Try,
     WrongPlaces,
-)
-from engram_lab.programs import Figure, command_line, numbers, report
-from engram_lab.studies.drives import drives_of
-from engram_lab.town.campaigns import BESIDE, MAPPED, estate
-from engram_lab.town.simulating import campaign_folder, simulate
-from engram_lab.trial_towns import (
-    BY_NIGHT,
-    FITTED_TOWNS,
-    HELD_OUT_TOWNS,
-    STREETS,
+    drives_in,
     other_towns,
+    street,
     streets,
     towns_folder,
 )
+from engram_lab.town.campaigns import BESIDE, MAPPED, estate
+from engram_lab.town.simulating import campaign_folder
 
 Array = NDArray[np.float64]
 
 # Tries of each kind on each street.
-TRIES = {Kind.UNDISTURBED: 1, Kind.TOLD: 24, Kind.CARRIED: 24, Kind.GAP: 6, Kind.LOST: 6}
+TRIES = {Kind.UNDISTURBED: 1, Kind.MISPLACED: 24, Kind.CARRIED: 24, Kind.GAP: 6, Kind.LOST: 6}
 _LOST_ROUNDS = 8
 # Before there is a calibration.
 AS_SUMMED = Calibration(knee=0.0, slope=1.0)
 # What a second match adds that agrees: two look-alikes agree more often than chance has it.
 WITNESS = 1.4
 # A robot that is told a wrong place is not looked for elsewhere: what it believes there counts.
-_NOT_LOOKED_FOR = frozenset({Kind.TOLD, Kind.CARRIED})
+_NOT_LOOKED_FOR = frozenset({Kind.MISPLACED, Kind.CARRIED})
 # Strength of the prior that weights are 0, in units of standardised terms.
 _RIDGE = 1.0
 _BIN = 1.0
@@ -108,7 +105,7 @@ class Row:
     @property
     def right(self) -> bool:
         """Whether it was right."""
-        return self.error_m <= FALSE_M and self.error_rad <= FALSE_RAD
+        return not is_false(self.error_m, self.error_rad)
 
     def to_json(self) -> str:
         """A line of text."""
@@ -155,11 +152,11 @@ class Rows:
 def collected(towns: Sequence[int], folder: Path, settings: Settings, monitor: Monitor) -> Rows:
     """The rows of some towns; those that an earlier run collected are read."""
     rows = Rows([], [])
-    for which in (STREETS, BY_NIGHT):
-        for name, street in streets(towns, settings, _LOST_ROUNDS, monitor, which):
-            _collect(rows, folder / name.replace("/", "-"), street, TRIES, monitor)
-    for name, street in other_towns(towns, settings, _LOST_ROUNDS, monitor):
-        _collect(rows, folder / name.replace("/", "-"), street, {Kind.LOST: 6}, monitor)
+    for which in (STREETS, AT_NIGHT):
+        for name, there in streets(towns, settings, _LOST_ROUNDS, monitor, which):
+            _collect(rows, folder / name.replace("/", "-"), there, TRIES, monitor)
+    for name, there in other_towns(towns, settings, _LOST_ROUNDS, monitor):
+        _collect(rows, folder / name.replace("/", "-"), there, {Kind.LOST: 6}, monitor)
     return rows
 
 
@@ -176,10 +173,11 @@ def _collect(
 
     def look_alikes() -> Iterator[Row]:
         places = WrongPlaces(street, _EVERY)
-        for there in places.lost():
-            for found in (there, *places.believed(there), *places.believed(there, usual)):
-                assert found.outcome.evidence is not None
-                yield Row(found.outcome.evidence, np.inf, np.pi)
+        for frame, there in places.lost():
+            near = places.expected(frame, there), places.expected(frame, there, usual)
+            for found in (there, *near[0], *near[1]):
+                assert found.evidence is not None
+                yield Row(found.evidence, np.inf, np.pi)
 
     here = _kept(path.with_name(f"{path.name}-{METHOD_VERSION}.jsonl"), met, monitor)
     usual = _usual(here)
@@ -393,21 +391,17 @@ def estate_rows(towns: Sequence[int], settings: Settings, monitor: Monitor) -> l
     """
     rows: list[Row] = []
     for seed in towns:
-        campaign, folder = estate(seed), towns_folder(settings)
-        simulate(campaign, folder, sessions=[MAPPED, BESIDE[0]], settings=settings, monitor=monitor)
-        mapped, beside = (
-            drives_of([campaign_folder(folder, campaign) / f"{plan.name}.framelog"])[0]
-            for plan in (campaign.session(MAPPED), campaign.session(BESIDE[0]))
-        )
-        path = campaign_folder(folder, campaign) / f"map{MAPPED}-{METHOD_VERSION}.engram"
-        street = Street(path, [mapped], beside, settings, _LOST_ROUNDS)
+        town = estate(seed)
+        drives = drives_in(town, settings, [MAPPED, BESIDE[0]], monitor)
+        there = street(town, [MAPPED], drives, drives[BESIDE[0]], settings, _LOST_ROUNDS)
+        path = campaign_folder(towns_folder(settings), town) / f"map{MAPPED}-{METHOD_VERSION}"
 
-        def met(street: Street = street) -> Iterator[Row]:
-            for looked in street.run(Try(Kind.COLD, 0)):
-                yield from rows_of(street, looked)
+        def met(there: Street = there) -> Iterator[Row]:
+            for looked in there.run(Try(Kind.COLD)):
+                yield from rows_of(there, looked)
 
-        rows += _kept(path.with_name(f"{path.stem}-beside.jsonl"), met, monitor)
-        street.close()
+        rows += _kept(path.with_name(f"{path.name}-beside.jsonl"), met, monitor)
+        there.close()
     return rows
 
 

@@ -19,6 +19,7 @@ from engram.graph.model import NodeId
 from engram.localiser.localisation import Localisation, Position
 from engram.localiser.settings import METHOD_VERSION
 from engram.maps.map import Map, open_map
+from engram_lab.accuracy import Fix, is_false
 from engram_lab.studies.faults.clips import Clip, ClipPlan, Plan
 from engram_lab.studies.faults.injected import FAULTS, FROM_THE_FIRST, Shown, undisturbed
 
@@ -42,13 +43,14 @@ class Place:
     opened: Map
     world_from_node: dict[NodeId, SE3]
 
-    def error(self, found: Localisation, world_from_cam: SE3) -> tuple[float, float] | None:
-        """How far off a fix is, metres and radians; None without one."""
+    def fix(self, at: int, found: Localisation, world_from_cam: SE3) -> Fix | None:
+        """The fix of a frame that was shown; None without one."""
         if found.node is None or found.node_from_live is None:
             return None
         node_from_live = self.world_from_node[found.node].inverse() @ world_from_cam
         wrong = node_from_live.inverse() @ found.node_from_live
-        return wrong.distance_m, wrong.angle_rad
+        false = is_false(wrong.distance_m, wrong.angle_rad)
+        return Fix(at, wrong.distance_m, false, found.confidence)
 
     def wrong_hint(
         self, world_from_cam: SE3, sigma_m: float, rng: np.random.Generator
@@ -220,10 +222,15 @@ class Scene:
     hint: Position | None = None
 
 
+def fault_of(number: int) -> str:
+    """The fault of a trial."""
+    return KINDS[number % len(KINDS)]
+
+
 def drawn(number: int, plans: Sequence[Plan]) -> tuple[str, Plan, np.random.Generator] | None:
     """Fault and clip of a trial, the rest is drawn from the generator; None without such a clip."""
     rng = np.random.default_rng([number, 0xFA017])
-    fault = KINDS[number % len(KINDS)]
+    fault = fault_of(number)
     against = fault in {REVERSE, TURNED}
     live = [plan for plan in plans if not plan.mapped and plan.reverse == against]
     return (fault, live[int(rng.integers(len(live)))], rng) if live else None

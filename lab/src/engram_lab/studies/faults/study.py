@@ -15,7 +15,7 @@ import os
 import shutil
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,6 +36,7 @@ from engram.robot.robot import Seen
 from engram.robot.settings import RobotOptions, Settings
 from engram.sequences.motion import Trajectory
 from engram.sequences.opening import open_drive
+from engram_lab.accuracy import Fix, events, way_m
 from engram_lab.studies.building import edge_errors
 from engram_lab.studies.faults.clips import JUDGING, REVERSED, Clip, ClipDrive, Plan
 from engram_lab.studies.faults.injected import undisturbed
@@ -49,6 +50,7 @@ from engram_lab.studies.faults.staging import (
     Trial,
     TrialFile,
     drawn,
+    fault_of,
     staged,
 )
 from engram_lab.truth import read_kitti_poses, read_matrix_truth
@@ -144,7 +146,7 @@ class RealPlan:
 
     Attributes:
         town: key in `DRIVES`.
-        part: "mapped"; "there", and back; or "back", and there.
+        part: "mapped"; "there", and back; "back", and there; or "whole", all frames as recorded.
         data: folder of the real data.
     """
 
@@ -182,8 +184,8 @@ class RealPlan:
         pairs = [one for one in open_drive(self.data / drive.folder) if isinstance(one, StereoPair)]
         truth = drive.read_truth(self.data / drive.truth_file, [one.stamp_ns for one in pairs])
         frames = [(pair, _pose(truth, pair)) for pair in pairs]
-        if self.mapped:
-            chosen = frames[drive.mapped]
+        if self.part in {"mapped", "whole"}:
+            chosen = frames[drive.mapped] if self.mapped else frames
         else:
             there = frames[drive.live]
             chosen = there + there[-2::-1] if self.part == "there" else there[::-1] + there[1:]
@@ -214,43 +216,16 @@ def real_plans() -> list[RealPlan]:
     return [RealPlan(town, part, data) for town in there for part in ("mapped", "there", "back")]
 
 
-# A fix further from the truth is false.
-FALSE_M = 1.0
-FALSE_RAD = float(np.deg2rad(5.0))
-# False fixes less than this apart are one event.
-_EVENT_M = 20.0
-
-
-@dataclass(frozen=True, slots=True)
-class Fix:
-    """A fix of a trial.
-
-    Attributes:
-        at: its place among the frames that were shown.
-        frame: number of the frame of the drive.
-        error_m: how far off it is.
-        false: whether that is too far.
-    """
-
-    at: int
-    frame: int
-    error_m: float
-    false: bool
-
-
 def localised(scene: Scene) -> tuple[list[Fix], list[str]]:
     """The fixes of a robot that meets a scene; fatal findings of its doctor."""
-    clip, hint, fixes = scene.clip, scene.hint, []
+    clip, hint, fixes = scene.clip, scene.hint, list[Fix]()
     with scene.place.opened.robot(clip.pairs[0].camera) as robot:
         for at, one in enumerate(scene.shown):
             if hint is not None and one.frame >= scene.start:
                 robot.place_at(hint)
                 hint = None
-            found = robot.step(one.pair)
-            error = scene.place.error(found, clip.world_from_cam[one.frame])
-            if error is not None:
-                false = error[0] > FALSE_M or error[1] > FALSE_RAD
-                fixes.append(Fix(at, one.frame, error[0], false))
+            fix = scene.place.fix(at, robot.step(one.pair), clip.world_from_cam[one.frame])
+            fixes += [] if fix is None else [fix]
         return fixes, [one.code for one in robot.diagnosis.fatal]
 
 
@@ -265,31 +240,20 @@ def run_trial(number: int, fault: str, scene: Scene, right: frozenset[int] = fro
     """
     clip = scene.clip
     trial = Trial(number, fault, clip.plan.name, scene.start, scene.strength, made_by=MADE_BY)
-    steps = zip(clip.world_from_cam, clip.world_from_cam[1:], strict=False)
-    trial.driven_m = sum((a.inverse() @ b).distance_m for a, b in steps)
+    trial.driven_m = way_m(clip.world_from_cam)
     fixes, trial.refused = localised(scene)
     trial.frames, trial.fixes = len(scene.shown), len(fixes)
-    trial.false, trial.events = sum(one.false for one in fixes), _events(fixes, clip)
+    false = [clip.world_from_cam[scene.shown[one.at].frame] for one in fixes if one.false]
+    trial.false, trial.events = len(false), events(false)
     trial.worst_m = max((one.error_m for one in fixes), default=0.0)
     found = [one for one in fixes if not one.false]
     expected = right & {one.frame for one in scene.shown}
     trial.expected = len(expected)
-    trial.lost = len(expected - {one.frame for one in found})
-    behind = [at for at, one in enumerate(scene.shown) if one.frame >= trial.start]
-    again = [one.at - behind[0] for one in found if behind and one.at >= behind[0]]
+    trial.lost = len(expected - {scene.shown[one.at].frame for one in found})
+    after = [at for at, one in enumerate(scene.shown) if one.frame >= trial.start]
+    again = [one.at - after[0] for one in found if after and one.at >= after[0]]
     trial.again = again[0] if again else None
     return trial
-
-
-def _events(fixes: Sequence[Fix], clip: Clip) -> int:
-    """Runs of false fixes."""
-    events, last = 0, None
-    for one in fixes:
-        if one.false:
-            here = clip.world_from_cam[one.frame]
-            events += last is None or (last.inverse() @ here).distance_m > _EVENT_M
-            last = here
-    return events
 
 
 def available() -> list[Plan]:
@@ -301,7 +265,11 @@ def available() -> list[Plan]:
 
 
 def run(
-    file: Path, trials: int, plans: Sequence[Plan] | None = None, monitor: Monitor = QUIET
+    file: Path,
+    trials: int,
+    plans: Sequence[Plan] | None = None,
+    monitor: Monitor = QUIET,
+    only: Collection[str] = KINDS,
 ) -> Iterator[Trial]:
     """Makes the trials up to a number that are missing from a file of results, by place.
 
@@ -310,12 +278,13 @@ def run(
         trials: how many in all.
         plans: the clips; None for those that are `available`.
         monitor: receives the fault of each trial, and may stop the run.
+        only: the faults that are made; the trials of the others are left out.
 
     Raises:
         ConfigError: the file holds trials of other versions.
     """
     plans, made = available() if plans is None else plans, TrialFile(file)
-    wanted = [(number, drawn(number, plans)) for number in range(trials)]
+    wanted = [(n, drawn(n, plans)) for n in range(trials) if fault_of(n) in only]
     left = [(number, *one) for number, one in wanted if one and number not in made.numbers]
     right: dict[str, frozenset[int]] = {}
     for town in dict.fromkeys(plan.town for _, _, plan, _ in left):
@@ -357,7 +326,7 @@ def _trial(
     if places.own and fault not in ELSEWHERE and plan.name not in right:
         clip = places.clip(plan)
         fixes, _ = localised(Scene(clip, places.own, 0, 0.0, undisturbed(clip.pairs)))
-        right[plan.name] = frozenset(one.frame for one in fixes if not one.false)
+        right[plan.name] = frozenset(one.at for one in fixes if not one.false)
     trial = run_trial(number, fault, scene, right.get(plan.name, frozenset()))
     map_on(trial, scene, places.folder / "mapped.engram")
     return trial
