@@ -783,11 +783,12 @@ void check_pose(const RenderCamera &camera, const Input<double, 2> &rotation,
 
 Light make_light(const Input<float, 1> &sun, const Input<float, 2> &vehicle, float sun_power,
                  float sky_power, float cloud, float cloud_x, float cloud_y, float fog_per_m,
-                 float haze, float wet, float snow, float headlights, float windows) {
+                 float haze, float wet, float snow, float headlights, float windows,
+                 float aureole) {
   if (sun.shape(0) != 3 || vehicle.shape(0) != 3 || vehicle.shape(1) != 3)
     throw nb::value_error("light: sun must have shape (3,) and vehicle (3, 3)");
   const float values[] = {sun_power, sky_power, cloud, cloud_x, cloud_y,    fog_per_m,
-                          haze,      wet,       snow,  headlights, windows};
+                          haze,      wet,       snow,  headlights, windows,    aureole};
   if (!all_finite(values, std::size(values)) || !all_finite(sun.data(), 3) ||
       !all_finite(vehicle.data(), 9))
     throw nb::value_error("light: must be finite");
@@ -797,7 +798,7 @@ Light make_light(const Input<float, 1> &sun, const Input<float, 2> &vehicle, flo
   light.sun_power = sun_power, light.sky_power = sky_power, light.cloud = cloud;
   light.cloud_shift[0] = cloud_x, light.cloud_shift[1] = cloud_y;
   light.fog_per_m = fog_per_m, light.haze = haze, light.wet = wet, light.snow = snow;
-  light.headlights = headlights, light.windows = windows;
+  light.headlights = headlights, light.windows = windows, light.aureole = aureole;
   return light;
 }
 
@@ -836,7 +837,7 @@ NB_MODULE(_town, module) {
   nb::class_<Light>(module, "Light")
       .def_static("of", &make_light, "sun"_a, "vehicle"_a, "sun_power"_a, "sky_power"_a, "cloud"_a,
                   "cloud_x"_a, "cloud_y"_a, "fog_per_m"_a, "haze"_a, "wet"_a, "snow"_a,
-                  "headlights"_a, "windows"_a);
+                  "headlights"_a, "windows"_a, "aureole"_a);
   nb::class_<RenderCamera>(module, "RenderCamera")
       .def(
           "__init__",

@@ -307,10 +307,6 @@ inline Floats ambient(const Frame &frame, const Point &point) {
   return from_sky + bounced;
 }
 
-// Share of the sun's light that comes from the bright haze around it and from sunlit walls about: it
-// falls from the sun's side, so that relief shows in the shade too, and shadows do not take it.
-constexpr float kAureole = 0.5f;
-
 inline Floats sunshine(const Frame &frame, const Point &point) {
   if (frame.light.sun_power <= 0)
     return Floats{};
@@ -331,7 +327,7 @@ inline Floats sunshine(const Frame &frame, const Point &point) {
   const Ints still_lit = turned & (lit > 0);
   if (frame.sun_moving.heights != nullptr && any(still_lit))
     lit *= sunlit(frame.sun_moving, near, plane, still_lit);
-  lit += kAureole * (1 - lit);
+  lit += frame.light.aureole * (1 - lit);
   return where(turned, frame.light.sun_power * facing * lit);
 }
 

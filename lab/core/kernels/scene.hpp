@@ -104,6 +104,9 @@ struct Light {
   float wet, snow;  // 0…1
   float headlights; // 0…1
   float windows;    // factor on the glow of surfaces
+  // Share of the sun's light that comes from the bright haze around it and from sunlit walls about:
+  // it falls from the sun's side, so that relief shows in the shade too; shadows do not take it.
+  float aureole;
   float vehicle[9]; // left and right headlight, and the direction they shine
 };
 

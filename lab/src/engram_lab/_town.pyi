@@ -22,6 +22,7 @@ class Light:
         snow: float,
         headlights: float,
         windows: float,
+        aureole: float,
     ) -> Light: ...
 
 class RenderCamera:

@@ -81,6 +81,7 @@ def _light(**changes: object) -> _town.Light:
         "sun": np.array([0, 0, 1], np.float32), "vehicle": np.zeros((3, 3), np.float32),
         "sun_power": 0.0, "sky_power": 1.0, "cloud": 0.0, "cloud_x": 0.0, "cloud_y": 0.0,
         "fog_per_m": 0.0, "haze": 1.0, "wet": 0.0, "snow": 0.0, "headlights": 0.0, "windows": 0.0,
+        "aureole": 0.5,
     }  # fmt: skip
     return _town.Light.of(**{**values, **changes})
 

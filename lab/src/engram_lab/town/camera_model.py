@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram_lab import _town
+from engram_lab.town.conditions import Moment, World
 from engram_lab.town.drive import Pose, Robot
+from engram_lab.town.glass import OPEN_GLASS, Glass, Pane, WetLens, film, streaks
 
 Luminance = NDArray[np.float32]
 Grey = NDArray[np.uint8]
@@ -39,11 +41,13 @@ class Lens:
     Attributes:
         dirt: 0…1, specks and smears that stay.
         covered_from_m, covered_to_m: stretch on which something lies over both lenses.
+        glass: what rain meets before both lenses, in world 6.
     """
 
     dirt: float = 0.0
     covered_from_m: float = np.inf
     covered_to_m: float = np.inf
+    glass: Glass = OPEN_GLASS
 
 
 CLEAN = Lens()
@@ -56,26 +60,38 @@ class CameraModel:
         robot: whose camera.
         seed: of noise, drops and dirt.
         lens: what is wrong with it.
+        world: whose rain and exposure.
     """
 
-    def __init__(self, robot: Robot, seed: int, lens: Lens) -> None:
+    def __init__(self, robot: Robot, seed: int, lens: Lens, world: World = World.FIVE) -> None:
         self._robot = robot
         self._seed = seed
         self._lens = lens
         self._gain: float | None = None
         self._sitting = [((-1, -1), np.zeros((0, 0), dtype=np.float32))] * 2
         self._dirt = [self._specks(eye) for eye in range(2)] if lens.dirt > 0 else []
+        self._world = world
+        panes = [
+            Pane(lens.glass, robot.camera, [seed & 0x7FFFFFFF, 0x61A5, eye]) for eye in range(2)
+        ]
+        self._eyes = [WetLens(pane, robot.camera) for pane in panes]
+
+    def stand_in(self, rate_mm_h: float, speed_m_s: float, seconds: float) -> None:
+        """What rain does to the glass of both eyes in so much time at a speed."""
+        for eye in self._eyes:
+            eye.pane.advance(rate_mm_h, speed_m_s, seconds)
 
     def expose(
-        self, luminance: Luminance, inverse_depths: Luminance, pose: Pose, rain: float, frame: int
-    ) -> tuple[Grey, Grey]:
+        self, luminance: Luminance, inverse_depths: Luminance, pose: Pose, moment: Moment,
+        frame: int,
+    ) -> tuple[Grey, Grey]:  # fmt: skip
         """The pair's grey images.
 
         Args:
             luminance: (2, height, width), linear.
             inverse_depths: (2, height, width), 1/m.
             pose: motion while the shutter is open.
-            rain: 0…1, drops on the lens and streaks in the air.
+            moment: light and weather there.
             frame: number of the frame, seeds its noise.
         """
         if self._lens.covered_from_m <= pose.driven_m < self._lens.covered_to_m:
@@ -88,8 +104,10 @@ class CameraModel:
             light = _veil(light, gain)
             if self._dirt:
                 light = _smudge(light, self._dirt[eye])
-            if rain > 0.05:
-                light = self._wet(light, rain, frame, eye)
+            if moment.rain > 0.05:
+                light = self._wet(light, moment.rain, frame, eye)
+            if self._world is World.SIX:
+                light = self._rained_on(light, moment, pose, shutter_s, eye)
             noise_seed = (self._seed * 1_000_003 + 2 * frame + eye) & 0xFFFFFFFFFFFF
             robot = self._robot
             pair.append(
@@ -135,6 +153,17 @@ class CameraModel:
             turned_deg, takes = float(rng.uniform(0, 180)), float(rng.uniform(0.3, 0.9))
             cv2.ellipse(mask, centre, axes, turned_deg, 0, 360, takes, -1)
         return np.asarray(cv2.GaussianBlur(mask, (0, 0), 4.0), dtype=np.float32)
+
+    def _rained_on(
+        self, light: Luminance, moment: Moment, pose: Pose, shutter_s: float, eye: int
+    ) -> Luminance:
+        """With the drops in the air and on the glass, which may have stopped falling."""
+        seed = [self._seed & 0x7FFFFFFF, 0xF114, eye]
+        if moment.rain_mm_h > 0.1:
+            air = [*seed, int(1e3 * pose.driven_m)]
+            light = streaks(light, self._robot.camera, moment.rain_mm_h, shutter_s, air)
+            light = film(light, moment.rain_mm_h, pose.elapsed_s, seed)
+        return self._eyes[eye].through(light)
 
     def _wet(self, light: Luminance, rain: float, frame: int, eye: int) -> Luminance:
         height, width = light.shape

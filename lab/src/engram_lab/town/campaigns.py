@@ -11,7 +11,7 @@ import numpy as np
 
 from engram.errors import ConfigError
 from engram_lab.town.camera_model import CLEAN, Lens
-from engram_lab.town.conditions import OXFORD, Place
+from engram_lab.town.conditions import OXFORD, Place, World
 from engram_lab.town.streets import (
     Fronts,
     Route,
@@ -97,6 +97,7 @@ class Campaign:
         place: where on earth.
         fronts: how the fronts repeat; None where each is unique.
         first_day: from which structural change counts.
+        world: how light, weather and life are made.
     """
 
     name: str
@@ -111,6 +112,7 @@ class Campaign:
     spacing_m: float = 0.7
     place: Place = OXFORD
     fronts: Fronts | None = None
+    world: World = World.FIVE
 
     @property
     def first_day(self) -> int:

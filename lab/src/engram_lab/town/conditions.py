@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +68,13 @@ def clear_sky_power(elevation_sine: float) -> float:
     return max(0.0035, 0.14 * 10 ** (elevation_deg / 3.6))
 
 
+class World(IntEnum):
+    """How light, weather and life are made; pictures of two worlds do not compare."""
+
+    FIVE = 5
+    SIX = 6
+
+
 @dataclass(frozen=True, slots=True)
 class Weather:
     """What the sky does, apart from the hour.
@@ -75,7 +83,7 @@ class Weather:
         cloud: share of the sky that is covered, on average over the drive, 0…1.
         changes: how far that share swings along the way, 0…1.
         fog_per_m: extinction of the air.
-        rain: how hard it rains, 0…1; `changes` makes it come and go.
+        rain: how hard it rains, mm/h; in world 5 0…1. `changes` makes it come and go.
         wet: film of water on the ground, 0…1.
         snow: how much lies, 0…1.
     """
@@ -99,6 +107,12 @@ WEATHERS: dict[str, Weather] = {
     "damp": Weather(cloud=0.9, changes=0.2, fog_per_m=0.001, wet=0.7),
     "snow": Weather(cloud=1.0, fog_per_m=0.010, snow=0.95),
     "thaw": Weather(cloud=0.6, changes=0.3, wet=0.6, snow=0.45),
+}
+# World 6: snow as it lies after the fall; rain clears the air but for its own drops.
+WEATHERS_6: dict[str, Weather] = WEATHERS | {
+    "rain": Weather(cloud=1.0, changes=0.2, fog_per_m=0.0015, rain=4.0, wet=1.0),
+    "showers": Weather(cloud=0.75, changes=0.5, fog_per_m=0.001, rain=2.0, wet=0.7),
+    "snow": Weather(cloud=1.0, fog_per_m=0.001, snow=0.75),
 }
 
 
@@ -124,9 +138,12 @@ class Moment:
         cloud: share of the sky covered.
         cloud_shift: (2,) drift of the clouds, in the noise's texels.
         fog_per_m, haze: extinction; luminance of the air as a factor of the sky's.
-        wet, snow, rain: 0…1.
+        wet, snow, rain: 0…1; rain is 0 in world 6.
         lamps_on: street lamps and lit windows.
         headlights_on: of the robot and of others.
+        rain_mm_h: 0 in world 5.
+        aureole: share of the sun's light that comes from around it and fills shadows.
+        beam: power of the robot's headlights.
     """
 
     sun_direction: NDArray[np.float64]
@@ -141,6 +158,14 @@ class Moment:
     rain: float
     lamps_on: bool
     headlights_on: bool
+    rain_mm_h: float = 0.0
+    aureole: float = 0.5
+    beam: float = 1.0
+
+
+# What world 6 is calibrated by (reports/town.md).
+_AUREOLE_6 = 0.5
+_BEAM_6 = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,12 +177,16 @@ class Conditions:
         weather: key in `WEATHERS`.
         seed: of how the clouds pass.
         place: where.
+        world: how weather is made.
+        rain_mm_h: mean rate, in place of the weather's; world 6 only.
     """
 
     start: datetime
     weather: str
     seed: int
     place: Place = OXFORD
+    world: World = World.FIVE
+    rain_mm_h: float | None = None
 
     def __post_init__(self) -> None:
         if self.weather not in WEATHERS:
@@ -184,6 +213,8 @@ class Conditions:
         The sun stands still during a drive (it moves 1° in four minutes); clouds pass over the
         robot every 50 to 300 m, and lamps come on one minute into civil twilight.
         """
+        if self.world is World.SIX:
+            return self._at_6(driven_m, elapsed_s)
         weather = WEATHERS[self.weather]
         sun = self._sun(0.0)
         swing = _drift(self.seed, driven_m)
@@ -207,6 +238,35 @@ class Conditions:
             rain=rain,
             lamps_on=lamps,
             headlights_on=dusk_deg < 1.5 or weather.fog_per_m > 0.01 or rain > 0.1,
+        )
+
+    def _at_6(self, driven_m: float, elapsed_s: float) -> Moment:
+        """In world 6: rain is a rate, and lies on the road, in the air and under the clouds."""
+        weather, swing = WEATHERS_6[self.weather], _drift(self.seed, driven_m)
+        rate = weather.rain if self.rain_mm_h is None else self.rain_mm_h
+        rate *= max(0.0, 1 + 1.6 * weather.changes * swing)
+        sun = self._sun(0.0)
+        cloud = float(np.clip(weather.cloud + weather.changes * swing, 0, 1))
+        shade = _shade(cloud, _drift(self.seed + 1, driven_m))
+        clear = clear_sky_power(float(sun[2]))
+        height_deg = float(np.degrees(np.arcsin(self._sun(elapsed_s)[2])))
+        return Moment(
+            sun_direction=sun if sun[2] > 0 else np.array([0.0, 0.0, 1.0]),
+            sun_power=clear_sun_power(float(sun[2])) * (1 - shade),
+            sky_power=clear * (1 + 0.9 * cloud - 0.45 * min(rate / 2.0, 1.0)),
+            cloud=cloud,
+            cloud_shift=(0.31 * elapsed_s + 17.0 * (self.seed % 97), 0.07 * elapsed_s),
+            # Extinction by the drops themselves (Atlas 1953).
+            fog_per_m=weather.fog_per_m + 0.0002 * rate**0.63,
+            haze=0.9,
+            wet=weather.wet,
+            snow=weather.snow,
+            rain=0.0,
+            lamps_on=height_deg < -1.0,
+            headlights_on=height_deg < 1.5 or weather.fog_per_m > 0.01 or rate > 0.1,
+            rain_mm_h=rate,
+            aureole=_AUREOLE_6,
+            beam=_BEAM_6,
         )
 
     def _sun(self, elapsed_s: float) -> NDArray[np.float64]:

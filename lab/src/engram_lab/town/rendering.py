@@ -13,8 +13,8 @@ from engram.frontend.frame import StereoPair
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram_lab import _town
-from engram_lab.town.camera_model import CLEAN, CameraModel
-from engram_lab.town.conditions import Conditions, Moment
+from engram_lab.town.camera_model import CLEAN, CameraModel, Lens
+from engram_lab.town.conditions import Conditions, Moment, World
 from engram_lab.town.drive import Pose, Robot, driving_line, pose_on, robot_named
 from engram_lab.town.mesh import Mesh
 from engram_lab.town.streets import Junction, loop_of_length
@@ -145,13 +145,15 @@ def _light(moment: Moment, world_from_cam: SE3) -> _town.Light:
         haze=moment.haze,
         wet=moment.wet,
         snow=moment.snow,
-        headlights=1.0 if moment.headlights_on else 0.0,
+        headlights=moment.beam if moment.headlights_on else 0.0,
         windows=_WINDOW_LUMINANCE if moment.lamps_on else 0.0,
+        aureole=moment.aureole,
     )
 
 
 LOOP_M = 150.0
 _PLACES_EVERY_M = 5.0
+_IN_RAIN_S = 120.0  # how long it has rained on the glass when a place is seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,12 +194,15 @@ class Places:
         style: of its textures.
         robot: whose camera.
         every_m: way between places.
+        world: how light and weather are made.
+        lens: of the robot.
     """
 
     def __init__(
         self, seed: int = 1, style: Style | None = None, robot: str = "wildcat",
-        every_m: float = _PLACES_EVERY_M,
+        every_m: float = _PLACES_EVERY_M, world: World = World.FIVE, lens: Lens = CLEAN,
     ) -> None:  # fmt: skip
+        self._world, self._lens = world, lens
         plan, route = loop_of_length(LOOP_M, seed)
         self.robot: Robot = robot_named(robot)
         self._town = Town(plan, route, style or Style())
@@ -219,7 +224,7 @@ class Places:
             visit: when.
             ahead_m, aside_m: of all places, or (P,) of each.
         """
-        conditions = Conditions(visit.start, visit.weather, visit.day)
+        conditions = self._conditions(visit)
         renderer = self._renderer(visit)
         camera, found = self.robot.camera, []
         starts_m = self._starts_m + ahead_m
@@ -231,8 +236,12 @@ class Places:
             luminance, inverse_depths = renderer.render(world_from_cam, camera, moment)
             twist = np.array([0, 0, 5.5, 0, 0, 0])
             pose = Pose(world_from_cam, float(start_m), 0.0, 5.5, twist)
-            model = CameraModel(self.robot, 1000 * visit.day + visit.start.hour, CLEAN)
-            left, right = model.expose(luminance, inverse_depths, pose, moment.rain, k)
+            seed = 1000 * visit.day + visit.start.hour
+            if self._world is World.SIX:  # each place's glass is its own
+                seed += 1_000_003 * (k + 1)
+            model = CameraModel(self.robot, seed, self._lens, self._world)
+            model.stand_in(moment.rain_mm_h, pose.speed_m_s, _IN_RAIN_S)
+            left, right = model.expose(luminance, inverse_depths, pose, moment, k)
             found.append((world_from_cam, StereoPair(k, left, right, camera)))
         return found
 
@@ -241,7 +250,10 @@ class Places:
         renderer = self._renderer(visit)
         return [renderer.depth(pose, self.robot.camera)[0] for pose in world_from_cams]
 
+    def _conditions(self, visit: Visit) -> Conditions:
+        return Conditions(visit.start, visit.weather, visit.day, world=self._world)
+
     def _renderer(self, visit: Visit) -> TownRenderer:
-        conditions = Conditions(visit.start, visit.weather, visit.day)
+        conditions = self._conditions(visit)
         today = Today(visit.day, conditions.hour, conditions.season, 0.45)
         return TownRenderer(self._town, today)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from engram.sequences.motion import Trajectory
 from engram.sequences.sequence import SequenceInfo
 from engram_lab.town.camera_model import CameraModel
 from engram_lab.town.campaigns import Campaign, SessionPlan
-from engram_lab.town.conditions import Conditions
+from engram_lab.town.conditions import Conditions, World
 from engram_lab.town.drive import DrivingStyle, Line, Pose, Robot, drive, driving_line, robot_named
 from engram_lab.town.mesh import FrameTruth, Mesh
 from engram_lab.town.rendering import TownRenderer
@@ -25,6 +26,7 @@ from engram_lab.town.textures import Style
 from engram_lab.town.town import Life, Today, Town
 
 _MOST_THREADS = 256  # of the core
+_IN_RAIN_BEFORE_S = 120.0  # how long a robot has driven when a session begins
 
 
 class SimulatedDrive:
@@ -52,7 +54,7 @@ class SimulatedDrive:
         self.plan: SessionPlan = campaign.session(session)
         self.robot: Robot = robot or robot_named(self.plan.robot)
         self.conditions = Conditions(
-            self.plan.start, self.plan.weather, self.plan.seed, campaign.place
+            self.plan.start, self.plan.weather, self.plan.seed, campaign.place, campaign.world
         )
         self._threads = threads
         self._stage: TownRenderer | None = None
@@ -78,14 +80,29 @@ class SimulatedDrive:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoPair]:
         """Pairs `start` to `stop`; the exposure settles again at the first."""
-        camera_model = CameraModel(self.robot, self.plan.seed, self.plan.lens)
+        world = self.campaign.world
+        camera_model = CameraModel(self.robot, self.plan.seed, self.plan.lens, world)
+        if world is World.SIX:
+            self._drive_through_rain(camera_model, start)
         for k, pose in enumerate(self.poses[start:stop], start):
             moment = self.conditions.at(pose.driven_m, pose.elapsed_s)
+            if world is World.SIX and k > start:
+                seconds = pose.elapsed_s - self.poses[k - 1].elapsed_s
+                camera_model.stand_in(moment.rain_mm_h, pose.speed_m_s, seconds)
             luminance, inverse_depths = self._renderer().render(
                 pose.world_from_cam, self.camera, moment, self._moving(pose)
             )
-            left, right = camera_model.expose(luminance, inverse_depths, pose, moment.rain, k)
+            left, right = camera_model.expose(luminance, inverse_depths, pose, moment, k)
             yield StereoPair(self.stamp_ns(k), left, right, self.camera)
+
+    def _drive_through_rain(self, camera_model: CameraModel, start: int) -> None:
+        """Leaves on the glass what fell before frame `start`, and before the drive."""
+        first = self.conditions.at(0.0, 0.0)
+        camera_model.stand_in(first.rain_mm_h, self.poses[0].speed_m_s, _IN_RAIN_BEFORE_S)
+        for before, pose in pairwise(self.poses[: start + 1]):
+            moment = self.conditions.at(pose.driven_m, pose.elapsed_s)
+            seconds = pose.elapsed_s - before.elapsed_s
+            camera_model.stand_in(moment.rain_mm_h, pose.speed_m_s, seconds)
 
     def truths(self, start: int = 0, stop: int | None = None) -> Iterator[FrameTruth]:
         """Truth of frames `start` to `stop`."""
