@@ -333,10 +333,15 @@ def partial_paths(connection: Connection, view: View) -> frozenset[PathId]:
     )
 
 
-def attempt_tables(connection: Connection, view: View) -> dict[int, Attempts]:
-    """Remembered attempts by key of their session."""
+def attempt_tables(
+    connection: Connection, view: View, session: int | None = None
+) -> dict[int, Attempts]:
+    """Remembered attempts by key of their session; of all sessions, or of one."""
+    query = view.select(attempts)
+    if session is not None:
+        query = query.where(attempts.c.session == session)
     found: dict[int, list[Attempts]] = {}
-    for row in view.rows(connection, attempts):
+    for row in verified(attempts, connection.execute(query)):
         found.setdefault(row["session"], []).append(unpack(row["body"], row["count"]))
     return {session: Attempts.joined(tables) for session, tables in found.items()}
 

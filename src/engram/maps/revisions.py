@@ -255,7 +255,7 @@ def stored_session(connection: Connection, view: View, session: Row) -> StoredSe
         key=lambda node: node.stamp_ns,
     )
     last_entry = _last_path_entry(connection, view, session["key"], session_id)
-    made = reading.attempt_tables(connection, view).get(session["key"])
+    made = reading.attempt_tables(connection, view, session["key"]).get(session["key"])
     return StoredSession(
         nodes=tuple(saved),
         last_entry=last_entry,

@@ -6,7 +6,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
-from sqlalchemy import ColumnElement, Connection, Select, Table, and_, func, or_, select
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Select,
+    Table,
+    and_,
+    bindparam,
+    func,
+    or_,
+    select,
+)
 
 from engram.errors import MapCorruptError
 from engram.graph.model import NodeId
@@ -109,6 +119,11 @@ def head(connection: Connection) -> int:
 
 # Of 64 bits, with room left: no writer comes near it.
 LARGEST_KEY = 2**62
+_NODE_OF_UUID = (
+    select(nodes.c.key, nodes.c.revision)
+    .where(nodes.c.uuid == bindparam("uuid"))
+    .order_by(nodes.c.key)
+)
 
 
 class KeyBook:
@@ -120,7 +135,9 @@ class KeyBook:
     def __init__(self, database: SqliteDatabase, view: View) -> None:
         self._database = database
         self._view = view
-        self._nodes: dict[bytes, int] | None = None  # read on first use
+        self._nodes: dict[bytes, int] = {}
+        # The visible revisions and the hidden nodes; read on first use.
+        self._seen: tuple[frozenset[object], frozenset[object]] | None = None
         with database.reading() as connection:
             self._next = {
                 table: (connection.execute(select(func.max(table.c.key))).scalar() or 0) + 1
@@ -145,22 +162,32 @@ class KeyBook:
     def set_view(self, view: View) -> None:
         """Changes the visible revision."""
         self._view = view
+        self._seen = None
 
     def find_node(self, node: NodeId) -> int | None:
         """Key of a node that is visible or was announced by `learn_node`; None if there is none."""
-        return self._known_nodes().get(node.bytes)
+        key = self._nodes.get(node.bytes)
+        if key is None:
+            found = self._database.first(_NODE_OF_UUID, {"uuid": node.bytes})
+            if found is None or not self._is_seen(*found):
+                return None
+            key = self._nodes[node.bytes] = int(found[0])
+        return key
 
     def learn_node(self, node: NodeId, key: int) -> None:
         """Announces a node that will be written."""
-        self._known_nodes()[node.bytes] = key
+        self._nodes[node.bytes] = key
 
     def forget_nodes(self) -> None:
-        """Forgets announced nodes."""
-        self._nodes = None
+        """Forgets announced nodes, and which are hidden."""
+        self._nodes.clear()
+        self._seen = None
 
-    def _known_nodes(self) -> dict[bytes, int]:
-        if self._nodes is None:
-            query = self._view.select(nodes).with_only_columns(nodes.c.uuid, nodes.c.key)
+    def _is_seen(self, key: int, revision: int) -> bool:
+        if self._seen is None:
             with self._database.reading() as connection:
-                self._nodes = {row[0]: row[1] for row in connection.execute(query)}
-        return self._nodes
+                self._seen = (
+                    frozenset(connection.execute(self._view.revision_keys()).scalars()),
+                    frozenset(connection.execute(self._view.hidden_keys(nodes)).scalars()),
+                )
+        return revision in self._seen[0] and key not in self._seen[1]
