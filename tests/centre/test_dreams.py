@@ -13,17 +13,15 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
-from sqlalchemy import inspect, text
 from tests.fleet.test_dreaming import ASKED as USUAL
 from tests.fleet.test_dreaming import nodes_of, town
 
 from engram.errors import WorkerError
 from engram.fleet.centre import merging, worker
-from engram.fleet.centre.database import dreams
 from engram.fleet.centre.errors import ConflictError
 from engram.fleet.centre.handins import HandIns
 from engram.fleet.centre.jobs import Dreams
-from engram.fleet.centre.service import Centre, MapPolicy
+from engram.fleet.centre.service import MapPolicy
 from engram.fleet.centre.worker import dream_a_while
 from engram.fleet.dream import DreamReport
 from engram.maps.map import Map
@@ -51,18 +49,6 @@ HOUR_NS = 3_600_000_000_000
 )
 def test_quiet_hours_may_go_past_midnight(quiet, hour, expected):
     assert MapPolicy(quiet=quiet).is_quiet(round(hour * HOUR_NS) + 24 * HOUR_NS) is expected
-
-
-def test_a_centre_of_the_version_before_gets_the_table(tmp_path):
-    with Centre(tmp_path) as centre, centre.database.writing() as connection:
-        connection.execute(text("DROP TABLE dreams"))
-        connection.execute(text("UPDATE centre SET version = 1"))
-    with Centre(tmp_path) as centre:
-        centre.add_map(NAME, "tests")
-        assert Dreams(centre).listed(NAME) == []
-        with centre.database.reading() as connection:
-            columns = {one["name"] for one in inspect(connection).get_columns("dreams")}
-    assert columns == {column.name for column in dreams.columns}
 
 
 def test_there_must_be_something_to_dream_of_and_to_judge_it_by(site, in_process):

@@ -2,38 +2,44 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import fields
 
 import pytest
 from sqlalchemy import update
 
 from engram.cli.settings import AllSettings
-from engram.fleet.centre.database import maps
+from engram.errors import FormatVersionError
+from engram.fleet.centre.database import centre
 from engram.fleet.centre.service import Centre, MapPolicy
 from engram.fleet.merge.settings import MergeOptions
 
-# The ranking stood under `policy`, and none was null.
-_OLD = {
-    "merge": {"policy": "path", "lanes": 1, "rounds": 8, "relocaliser": None, "author": "me"},
-    "gate": ["held-out.framelog"],
-    "moves": "stable",
-    "quiet": None,
-}
+from .conftest import drive
 
 
-@pytest.mark.parametrize("relocaliser", [None, "exhaustive"])
-def test_a_policy_of_an_older_version_is_read(tmp_path, relocaliser):
-    options = {**_OLD, "merge": {**_OLD["merge"], "relocaliser": relocaliser}}
-    merge = MergeOptions("path", 1, 8, relocaliser or "none", author="me")
+def test_a_policy_is_read_as_it_was_set(tmp_path):
+    merge = MergeOptions("path", 1, 8, "none", author="me")
+    policy = MapPolicy(merge, ("held-out.framelog",), "stable", (22.0, 5.0))
     with Centre(tmp_path) as centre:
-        centre.add_map("fleet", "tests")
-        with centre.database.writing() as connection:
-            connection.execute(update(maps).values(options=json.dumps(options)))
-        read = centre.policy("fleet")
-        assert read == MapPolicy(merge, ("held-out.framelog",), "stable")
-        centre.set_policy("fleet", read, "tests")
-        assert centre.policy("fleet") == read
+        centre.add_map("fleet", "tests", policy)
+    with Centre(tmp_path) as centre:
+        assert centre.policy("fleet") == policy
+
+
+@pytest.mark.parametrize("version", [1, 2, 4])
+def test_tables_of_another_version_are_refused_with_what_to_do(tmp_path, version):
+    with Centre(tmp_path) as opened, opened.database.writing() as connection:
+        connection.execute(update(centre).values(version=version))
+    with pytest.raises(FormatVersionError, match=rf"of version {version}, .* enrol the robots"):
+        Centre(tmp_path)
+
+
+def test_maps_that_were_copied_into_a_new_centre_are_served_there(tmp_path):
+    (tmp_path / "maps").mkdir()
+    drive(tmp_path / "maps" / "fleet.engram", "r1", 1_000)
+    with Centre(tmp_path) as opened:
+        opened.add_map("fleet", "tests")
+        with opened.reading("fleet") as store:
+            assert store.revision == 1
 
 
 def test_a_merge_goes_by_the_settings_of_the_table():

@@ -35,7 +35,6 @@ from sqlalchemy import (
     make_url,
     select,
     text,
-    update,
 )
 from sqlalchemy.dialects.postgresql import insert as insert_postgresql
 from sqlalchemy.dialects.sqlite import insert as insert_sqlite
@@ -46,7 +45,7 @@ from engram.errors import FormatVersionError, InputError, MissingExtraError, Sto
 from engram.fleet.centre.errors import StoreError
 from engram.sqlite import is_full
 
-VERSION = 2
+VERSION = 3
 
 metadata = MetaData()
 _INT = BigInteger().with_variant(Integer(), "sqlite")
@@ -266,7 +265,7 @@ class ServiceDatabase:
 
     Raises:
         InputError: the address is not one.
-        FormatVersionError: a newer Engram wrote it.
+        FormatVersionError: its tables are of another version.
         StoreError: it cannot be reached.
     """
 
@@ -277,7 +276,7 @@ class ServiceDatabase:
         self._turn = threading.Lock()
         self._log = _SharedSync(f"{self._engine.url.database}-wal")
         with self.writing() as connection:
-            self._migrate(connection)
+            self._make_tables(connection)
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -331,32 +330,20 @@ class ServiceDatabase:
         self._engine.dispose()
 
     @staticmethod
-    def _migrate(connection: Connection) -> None:
-        """Brings the tables to this version, in the transaction that is open."""
+    def _make_tables(connection: Connection) -> None:
+        """Makes the tables in an empty database; refuses those of another version."""
         if not inspect(connection).has_table(centre.name):
             metadata.create_all(connection)
             connection.execute(insert(centre).values(key=1, version=VERSION))
             return
         version = connection.execute(select(centre.c.version)).scalar_one()
-        if version > VERSION:
+        if version != VERSION:
             raise FormatVersionError(
-                f"the centre's tables are of version {version}, this Engram reads up to "
-                f"{VERSION}: upgrade Engram ({__version__} is {PRE_RELEASE})"
+                f"the centre's tables are of version {version}, Engram {__version__} "
+                f"({PRE_RELEASE}) uses {VERSION}: open it with the Engram that wrote it, or copy "
+                "its maps/*.engram into a new centre, give each to engram centre map, and enrol "
+                "the robots there"
             )
-        for step in range(version, VERSION):
-            for statement in MIGRATIONS[step]:
-                connection.execute(text(statement))
-        connection.execute(update(centre).values(version=VERSION))
-
-
-# Statements that bring the tables from this version to the next.
-MIGRATIONS: dict[int, tuple[str, ...]] = {
-    1: (
-        "CREATE TABLE dreams (id TEXT NOT NULL PRIMARY KEY, map TEXT NOT NULL, state TEXT NOT NULL,"
-        " asked_by TEXT NOT NULL, asked_ns BIGINT NOT NULL, ended_ns BIGINT, since BIGINT NOT NULL,"
-        " revision BIGINT, progress TEXT NOT NULL, report TEXT, error TEXT)",
-    ),
-}
 
 
 def rows_of(connection: Connection, query: Select[Any]) -> list[dict[str, Any]]:

@@ -32,7 +32,7 @@ from engram.fleet.centre.database import (
 )
 from engram.fleet.centre.errors import UnknownError
 from engram.fleet.centre.objects import BucketObjects, FolderObjects, Objects, Packs
-from engram.fleet.merge.settings import NO_RELOCALISER, MergeOptions
+from engram.fleet.merge.settings import MergeOptions
 from engram.maps.map import Map
 from engram.maps.map_reader import MapReader
 from engram.maps.records import Revision
@@ -404,7 +404,7 @@ class Centre:
 
     def policy(self, name: str) -> MapPolicy:
         """How a map takes hand-ins."""
-        return from_dict(_renamed(json.loads(self.map_row(name)["options"])), MapPolicy)
+        return from_dict(json.loads(self.map_row(name)["options"]), MapPolicy)
 
     def set_policy(self, name: str, policy: MapPolicy, by: str) -> None:
         """Changes how a map takes hand-ins."""
@@ -426,15 +426,6 @@ class Centre:
         with self.database.writing() as connection:
             self.database.put(connection, maps, row)
             note(connection, self.now_ns(), by, "durable", name, revision=revision)
-
-
-def _renamed(policy: dict[str, Any]) -> dict[str, Any]:
-    """A stored `MapPolicy`, with the settings' names in place of those that it was stored by."""
-    merge = dict(policy["merge"])
-    if "policy" in merge:
-        merge["ranking"] = merge.pop("policy")
-        merge["relocaliser"] = merge["relocaliser"] or NO_RELOCALISER
-    return {**policy, "merge": merge}
 
 
 def kept_since_ns(centre: Centre) -> int:
