@@ -12,7 +12,7 @@ from engram.errors import ConfigError, IncompatibleError, InputError, StorageFul
 from engram.fleet.agent.agent import Agent
 from engram.fleet.agent.link import CentreRefusedError, Unreachable, enrol
 from engram.fleet.agent.state import AgentSettings, AgentState
-from engram.fleet.centre import merging
+from engram.fleet.centre import merge_job
 from engram.fleet.centre.serving import back_up
 from engram.fleet.cli.agent_verbs import _open, sync
 from engram.fleet.transfers import Manifest, PartHash, encode_manifest, part_hash
@@ -21,7 +21,7 @@ from engram.maps.map import Map
 
 @pytest.fixture
 def site(tmp_path, monkeypatch):
-    monkeypatch.setattr(merging, "admit", admit_here)
+    monkeypatch.setattr(merge_job, "admit", admit_here)
     found = Site(tmp_path)
     yield found
     found.close()

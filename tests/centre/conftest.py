@@ -16,10 +16,10 @@ from tests.maps.maps import begin, session, write_drive
 
 from engram.fleet.agent.agent import Agent
 from engram.fleet.agent.link import enrol
-from engram.fleet.centre import merging
+from engram.fleet.centre import merge_job
 from engram.fleet.centre.access import Role, add_person, new_code
-from engram.fleet.centre.app import create_app
-from engram.fleet.centre.merging import write_checked
+from engram.fleet.centre.application import create_app
+from engram.fleet.centre.merge_job import write_checked
 from engram.fleet.centre.service import Centre, MapPolicy
 from engram.fleet.centre.worker import work_off
 from engram.fleet.merge.settings import MergeOptions
@@ -91,7 +91,7 @@ class Site:
         return Agent(self.folder / name, client=self.link, chance=lambda: 0.0)
 
     def work(self) -> int:
-        return work_off(self.centre, merging.merge_hand_in)
+        return work_off(self.centre, merge_job.merge_hand_in)
 
     def settle(self) -> None:
         """Until nobody has anything to do."""
@@ -179,7 +179,7 @@ def _run(url, statement: str) -> None:
 @pytest.fixture
 def in_process(monkeypatch):
     """Admission without a process of its own: the same steps, and faults reach them."""
-    monkeypatch.setattr(merging, "admit", admit_here)
+    monkeypatch.setattr(merge_job, "admit", admit_here)
 
 
 def admit_here(manifest, parts, path, *limits) -> None:

@@ -15,13 +15,13 @@ from sqlalchemy import delete, insert
 
 from engram.errors import ConfigError, InputError
 from engram.fleet.agent.link import CentreRefusedError, enrol
-from engram.fleet.centre import serving
-from engram.fleet.centre.access import Role, add_person, disable, new_code, take_away
-from engram.fleet.centre.database import _hash, audit, first_broken
-from engram.fleet.centre.errors import UnknownError
-from engram.fleet.centre.fleet import Fleet
-from engram.fleet.centre.jobs import Dreams
+from engram.fleet.centre import dreams, serving
+from engram.fleet.centre.access import Role, add_person, disable, new_code, revoke_access
+from engram.fleet.centre.database import _hash, first_broken
+from engram.fleet.centre.fleet import robots_of
+from engram.fleet.centre.problems import UnknownError
 from engram.fleet.centre.serving import Listening, serve
+from engram.fleet.centre.tables import Event, audit, values_of
 
 from .conftest import NAME, POLICY, drive
 
@@ -98,12 +98,12 @@ BODIES = {
 @pytest.fixture(scope="module")
 def used(tmp_path_factory):
     """A centre with a map that was handed in and asked for, and everybody's tokens."""
-    from engram.fleet.centre import merging
+    from engram.fleet.centre import merge_job
 
     from .conftest import Site, admit_here
 
     patch = pytest.MonkeyPatch()
-    patch.setattr(merging, "admit", admit_here)
+    patch.setattr(merge_job, "admit", admit_here)
     site = Site(tmp_path_factory.mktemp("used"))
     site.centre.add_map("other", "tests", POLICY)
     own, robot, foreign = site.robot("r1"), site.robot("r2"), site.robot("r3")
@@ -113,7 +113,7 @@ def used(tmp_path_factory):
     with site.centre.database.writing() as connection:
         from sqlalchemy import update
 
-        from engram.fleet.centre.database import grants
+        from engram.fleet.centre.tables import grants
 
         connection.execute(
             update(grants)
@@ -136,7 +136,7 @@ def used(tmp_path_factory):
     site.centre.set_policy(NAME, replace(POLICY, gate=("a", "b", "c")), "tests")
     places = {
         "name": NAME,
-        "dream": Dreams(site.centre).ask(NAME, "tests")["id"],
+        "dream": dreams.ask(site.centre, NAME, "tests").id,
         "handin": next(iter(handin.values())),
         "job": next(iter(handin.values())),
         "artifact": artifact,
@@ -248,10 +248,9 @@ def test_a_long_audit_log_is_checked_in_little_memory(site):
         connection.execute(delete(audit))
         rows, before = [], ""
         for number in range(1, 5_001):
-            row = {"number": number, "at_ns": 1, "subject": "s", "action": "a", "map": ""}
-            row["detail"] = "{}"
+            row = Event(number, 1, subject="s", action="a", map="", detail="{}", hash="")
             before = _hash(before, row)
-            rows.append({**row, "hash": before})
+            rows.append(values_of(replace(row, hash=before)))
         connection.execute(insert(audit), rows)
         del rows
         tracemalloc.start()
@@ -309,7 +308,7 @@ def test_a_robot_that_enrols_again_has_its_new_name_and_one_taken_away_is_told(s
         enrol(agent.folder, "http://centre/", code, "renamed", site.http)
 
     again()
-    assert [one["name"] for one in Fleet(site.centre).all(NAME)] == ["renamed"]
+    assert [row.name for row in robots_of(site.centre, NAME)] == ["renamed"]
     disable(site.centre, agent.state.fact("robot"), "tests")
     with pytest.raises(CentreRefusedError, match=r"\(403\): this robot was removed"):
         again()
@@ -318,16 +317,16 @@ def test_a_robot_that_enrols_again_has_its_new_name_and_one_taken_away_is_told(s
 def test_a_person_or_robot_is_taken_away_by_name(site):
     token = {"Authorization": f"Bearer {add_person(site.centre, 'Åsa', NAME, Role.ADMIN)}"}
     assert site.http.get("/v1/me", headers=token).status_code == 200
-    take_away(site.centre, "Åsa", "tests")
+    revoke_access(site.centre, "Åsa", "tests")
     assert site.http.get("/v1/me", headers=token).status_code == 401
     with pytest.raises(UnknownError, match="'Åsa' has no token"):
-        take_away(site.centre, "Åsa", "tests")
+        revoke_access(site.centre, "Åsa", "tests")
     first, second = site.robot("r1"), site.robot("r2")
     code = new_code(site.centre, NAME, "head", "tests")
     enrol(second.folder, "http://centre", code, "r1", site.http)
     with pytest.raises(InputError, match="2 robots are called 'r1'"):
-        take_away(site.centre, "r1", "tests")
-    take_away(site.centre, first.state.fact("robot"), "tests")
+        revoke_access(site.centre, "r1", "tests")
+    revoke_access(site.centre, first.state.fact("robot"), "tests")
     first.step()
     second.step()
     assert "was removed" in str(first.trouble)

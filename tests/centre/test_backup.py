@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from sqlalchemy import update
 
 from engram.errors import InputError, StorageFullError
 from engram.fleet.centre import serving
-from engram.fleet.centre.database import handins, maps
-from engram.fleet.centre.fleet import Refs
+from engram.fleet.centre.fleet import move_ref, revision_of
 from engram.fleet.centre.service import Centre
 from engram.fleet.centre.serving import back_up
+from engram.fleet.centre.tables import handins
 from engram.maps.map import Map
 from engram.maps.map_files import copy_map
 
@@ -23,7 +25,7 @@ def test_a_backup_holds_the_folder_and_robots_may_forget(site, in_process, tmp_p
     agent.hand_in()
     site.settle()
     assert back_up(site.centre, tmp_path / "backup") == {NAME: 1}
-    assert site.centre.map_row(NAME)["durable_revision"] == 1
+    assert site.centre.map_row(NAME).durable_revision == 1
     with Map.open(tmp_path / "backup" / "maps" / f"{NAME}.engram") as copy:
         assert copy.content_hash() == site.content()
     # PostgreSQL and a bucket are copied by their own tools.
@@ -57,10 +59,10 @@ def test_robots_hand_in_again_what_an_older_file_that_was_put_back_lacks(
     drive(agent.live, "r1", 2_000)
     agent.hand_in()
     site.settle()
-    Refs(site.centre).move(NAME, "stable", 2, "tests", None)
-    row = {**site.centre.map_row(NAME), "durable_revision": 2}
+    move_ref(site.centre, NAME, "stable", 2, "tests")
+    row = replace(site.centre.map_row(NAME), durable_revision=2)
     with site.centre.database.writing() as connection:
-        site.centre.database.put(connection, maps, row)
+        site.centre.database.put(connection, row)
         tried = site.centre.settings.merge_tries
         connection.execute(update(handins).values(tries=tried))
     site.centre.close()
@@ -69,8 +71,8 @@ def test_robots_hand_in_again_what_an_older_file_that_was_put_back_lacks(
     (tmp_path / "older.engram").rename(path)
     site.restart()
     site.centre.add_map(NAME, "tests")
-    assert site.centre.map_row(NAME)["durable_revision"] == 1
-    assert Refs(site.centre).revision(NAME, "stable") == 1
+    assert site.centre.map_row(NAME).durable_revision == 1
+    assert revision_of(site.centre, NAME, "stable") == 1
     site.settle()
     with Map.open(path) as store:
         assert {one.start_ns for one in store.sessions.values()} == {1_000, 2_000}
@@ -95,5 +97,5 @@ def test_a_backup_that_does_not_fit_leaves_nothing_and_robots_forget_nothing(
         with pytest.raises(StorageFullError):
             back_up(site.centre, tmp_path / "held" / "backup")
     assert list((tmp_path / "held").iterdir()) == []
-    assert site.centre.map_row(NAME)["durable_revision"] == 0
+    assert site.centre.map_row(NAME).durable_revision == 0
     assert back_up(site.centre, tmp_path / "held" / "backup") == {NAME: 0}

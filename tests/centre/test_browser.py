@@ -8,8 +8,8 @@ import threading
 import pytest
 import uvicorn
 
-from engram.fleet.centre.app import create_app
-from engram.fleet.centre.fleet import Fleet, Refs
+from engram.fleet.centre.application import create_app
+from engram.fleet.centre.fleet import ref_of, robots_of
 from engram.maps.map import Map
 
 from .conftest import NAME, drive
@@ -93,14 +93,14 @@ def test_a_version_for_a_robot_and_a_revert_with_its_preview(page, site):
     page.fill("input[name=revision]", "1")
     with page.expect_navigation():
         page.get_by_role("button", name="Move").click()
-    assert Refs(site.centre).get(NAME, "canary")["revision"] == 1
+    assert ref_of(site.centre, NAME, "canary").revision == 1
 
     page.goto(f"/maps/{NAME}/fleet")
     field = page.get_by_label("What r2 follows")
     field.fill("canary")
     with page.expect_navigation():
         field.press("Enter")
-    follows = {one["name"]: one["follows"] for one in Fleet(site.centre).all(NAME)}
+    follows = {row.name: row.follows for row in robots_of(site.centre, NAME)}
     assert follows == {"r1": "head", "r2": "canary"}
     page.get_by_label("What r1 follows").fill("no-such-ref")
     page.get_by_label("What r1 follows").press("Enter")

@@ -10,7 +10,8 @@ import pytest
 from sqlalchemy import select
 
 from engram.errors import MapError
-from engram.fleet.centre.database import ServiceDatabase, usage
+from engram.fleet.centre.database import ServiceDatabase
+from engram.fleet.centre.tables import Usage, usage
 
 THREADS = 8
 
@@ -24,7 +25,7 @@ def database(tmp_path):
 
 def write(database, subject: str, *, durable: bool = True) -> None:
     with database.writing(durable=durable) as connection:
-        database.put(connection, usage, {"subject": subject, "day": 1, "bytes": 1})
+        database.put(connection, Usage(subject, day=1, bytes=1))
 
 
 def days(database) -> set[str]:

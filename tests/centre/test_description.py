@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from engram.fleet.centre.app import create_app
+from engram.fleet.centre.application import create_app
 
 DESCRIBED = create_app(None).openapi()
 OPERATIONS = [

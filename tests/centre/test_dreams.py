@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 import time
@@ -17,11 +16,10 @@ from tests.fleet.test_dreaming import ASKED as USUAL
 from tests.fleet.test_dreaming import nodes_of, town
 
 from engram.errors import WorkerError
-from engram.fleet.centre import merging, worker
-from engram.fleet.centre.errors import ConflictError
-from engram.fleet.centre.handins import HandIns
-from engram.fleet.centre.jobs import Dreams
+from engram.fleet.centre import dreams, handins, jobs, merge_job, worker
+from engram.fleet.centre.problems import ConflictError
 from engram.fleet.centre.service import MapPolicy
+from engram.fleet.centre.tables import Dream, HandIn
 from engram.fleet.centre.worker import dream_a_while
 from engram.fleet.dream import DreamReport
 from engram.maps.map import Map
@@ -52,57 +50,53 @@ def test_quiet_hours_may_go_past_midnight(quiet, hour, expected):
 
 
 def test_there_must_be_something_to_dream_of_and_to_judge_it_by(site, in_process):
-    jobs = Dreams(site.centre)
     with pytest.raises(ConflictError, match="0 held-out drives"):
-        jobs.ask(NAME, "tests")
+        dreams.ask(site.centre, NAME, "tests")
     judged(site)
     with pytest.raises(ConflictError, match="nothing is merged"):
-        jobs.ask(NAME, "tests")
+        dreams.ask(site.centre, NAME, "tests")
 
 
 def test_the_worker_asks_in_quiet_hours_and_a_person_at_any_time(site, in_process):
     handed_in(site, "r1", 1_000)
     judged(site)
-    jobs = Dreams(site.centre)
-    jobs.ask_quietly()
-    assert jobs.listed(NAME) == []
+    dreams.ask_quietly(site.centre)
+    assert dreams.listed(site.centre, NAME) == []
     judged(site, quiet=hours_from(site, 0.0))
-    jobs.ask_quietly()
-    (row,) = jobs.due()
+    dreams.ask_quietly(site.centre)
+    (row,) = dreams.due(site.centre)
     judged(site, quiet=hours_from(site, 3.0))
-    assert jobs.due() == []
+    assert dreams.due(site.centre) == []
     answer = site.http.post(f"/v1/maps/{NAME}/dreams", headers=site.token("operator"))
-    assert answer.json()["id"] == row["id"]
-    assert [one["id"] for one in jobs.due()] == [row["id"]]
+    assert answer.json()["id"] == row.id
+    assert [one.id for one in dreams.due(site.centre)] == [row.id]
     told = site.http.get(f"/v1/maps/{NAME}/jobs", headers=site.token("viewer")).json()
-    assert [(one["kind"], one["id"]) for one in told] == [("dream", row["id"])]
+    assert [(one["kind"], one["id"]) for one in told] == [("dream", row.id)]
 
 
 def test_a_dream_that_a_hand_in_has_overtaken_is_asked_for_anew(site, in_process):
     handed_in(site, "r1", 1_000)
     judged(site)
-    jobs = Dreams(site.centre)
-    before = jobs.ask(NAME, "tests")
+    before = dreams.ask(site.centre, NAME, "tests")
     judged(site, gate=())
     handed_in(site, "r2", 5_000)
     judged(site)
-    (row,) = jobs.due()
-    assert row["id"] != before["id"]
-    assert row["asked_by"] == "tests"
-    assert jobs.get(before["id"])["state"] == "cancelled"
+    (row,) = dreams.due(site.centre)
+    assert row.id != before.id
+    assert row.asked_by == "tests"
+    assert jobs.get(site.centre, Dream, before.id).state == "cancelled"
 
 
 def test_what_a_person_hid_is_not_dreamt_of_until_it_is_handed_in_again(site, in_process):
     handed_in(site, "r1", 1_000)
     handed_in(site, "r2", 5_000)
-    jobs = Dreams(site.centre)
-    assert len(jobs.handed(NAME)) == 2
+    assert len(dreams.merged_handins(site.centre, NAME)) == 2
     with Map.open(site.centre.map_path(NAME)) as store:
         store.revert(1, author="tests")
-    (row,) = jobs.handed(NAME)
-    assert row["robot"] == site.robot("r2").state.fact("robot")
+    (row,) = dreams.merged_handins(site.centre, NAME)
+    assert row.robot == site.robot("r2").state.fact("robot")
     handed_in(site, "r1", 9_000)
-    assert len(jobs.handed(NAME)) == 2
+    assert len(dreams.merged_handins(site.centre, NAME)) == 2
 
 
 def test_a_robots_map_is_put_together_with_what_it_got_from_the_fleet(site, in_process, tmp_path):
@@ -112,11 +106,14 @@ def test_a_robots_map_is_put_together_with_what_it_got_from_the_fleet(site, in_p
     site.settle()
     assert second.switch()
     handed_in(site, "r2", 5_000)
-    jobs = Dreams(site.centre)
-    (row,) = [one for one in jobs.handed(NAME) if one["robot"] == second.state.fact("robot")]
-    manifest = jobs.manifest(row)
+    (row,) = [
+        one
+        for one in dreams.merged_handins(site.centre, NAME)
+        if one.robot == second.state.fact("robot")
+    ]
+    manifest = handins.manifest_of(site.centre, row)
     path = tmp_path / "r2.engram"
-    admit_here(manifest, jobs.parts(row, manifest), path)
+    admit_here(manifest, dreams.parts_of(site.centre, row, manifest), path)
     with Map.open(path) as store, Map.open(second.live) as live:
         assert store.content_hash() == live.content_hash()
         assert len(list(store.frames.stored(store.load().nodes))) == len(live.load().nodes)
@@ -137,10 +134,10 @@ class DreamMachine(RuleBasedStateMachine):
         super().__init__()
         self.folder = Path(tempfile.mkdtemp())
         self.patch = pytest.MonkeyPatch()
-        self.patch.setattr(merging, "admit", admit_here)
+        self.patch.setattr(merge_job, "admit", admit_here)
         self.patch.setattr(worker, "admit", admit_here)
         self.patch.setattr(worker, "dream", self.dreamt)
-        self.patch.setattr(worker, "_dream_beside", self.beside)
+        self.patch.setattr(worker, "_dream_apart", self.beside)
         self.site = Site(self.folder)
         self.whole: list[tuple[str, ...]] = []
         self.ended: set[str] = set()
@@ -150,7 +147,7 @@ class DreamMachine(RuleBasedStateMachine):
         self.policy(quiet=False)
 
     def beside(self, centre, row, wait, stopped, scheduler) -> None:
-        assert not any(map(HandIns(centre).waiting, centre.map_names()))
+        assert jobs.pending(centre, HandIn) == []
         worker.dream_of(centre, row)
 
     def dreamt(self, path, handed, *_) -> DreamReport:
@@ -177,13 +174,13 @@ class DreamMachine(RuleBasedStateMachine):
 
     @rule()
     def ask(self) -> None:
-        if Dreams(self.site.centre).handed(NAME):
-            Dreams(self.site.centre).ask(NAME, "tests")
+        if dreams.merged_handins(self.site.centre, NAME):
+            dreams.ask(self.site.centre, NAME, "tests")
 
     @rule()
     def cancel(self) -> None:
-        for row in Dreams(self.site.centre).listed(NAME, "asked"):
-            Dreams(self.site.centre).cancel(row, "tests")
+        for row in jobs.pending(self.site.centre, Dream, NAME):
+            jobs.cancel(self.site.centre, row, "tests")
 
     @rule(at=st.integers(1, 60))
     def work(self, at: int) -> None:
@@ -202,11 +199,11 @@ class DreamMachine(RuleBasedStateMachine):
 
     @invariant()
     def what_is_done_stays_done_and_nothing_is_left(self) -> None:
-        rows = Dreams(self.site.centre).listed(NAME)
-        done = {row["id"] for row in rows if row["state"] == "done"}
+        rows = dreams.listed(self.site.centre, NAME)
+        done = {row.id for row in rows if row.state == "done"}
         assert self.ended <= done
         self.ended = done
-        assert not any(row["state"] == "failed" for row in rows), rows
+        assert not any(row.state == "failed" for row in rows), rows
 
     def teardown(self) -> None:
         try:
@@ -215,14 +212,15 @@ class DreamMachine(RuleBasedStateMachine):
             while self.site.work():
                 pass
             self.policy(quiet=True)
-            merged = Dreams(self.site.centre).handed(NAME)
+            merged = dreams.merged_handins(self.site.centre, NAME)
             while dream_a_while(self.site.centre, lambda _: None, lambda: False):
                 pass
-            jobs = Dreams(self.site.centre)
-            state = jobs.get(jobs.key(NAME))["state"] if merged else "done"
+            centre, state = self.site.centre, "done"
+            if merged:
+                state = jobs.get(centre, Dream, dreams.key_of(centre, NAME)).state
             assert state in {"done", "cancelled"}
             if state == "done" and merged:
-                assert tuple(row["content_hash"] for row in merged) in self.whole
+                assert tuple(row.content_hash for row in merged) in self.whole
             assert not list((self.site.centre.folder / "work").glob("[!.]*"))
         finally:
             self.site.close()
@@ -261,25 +259,24 @@ def test_a_better_order_becomes_a_revision_and_a_hand_in_interrupts(tmp_path, to
         site.settle()
     before = nodes_of(site.centre.map_path(NAME))
     site.centre.set_policy(NAME, policy, "tests")
-    jobs = Dreams(site.centre)
-    row = jobs.ask(NAME, "tests")
+    row = dreams.ask(site.centre, NAME, "tests")
     asked = iter([False, True])
     with monkeypatch.context() as patch:
         patch.setattr(worker, "_is_asked_for", lambda _: next(asked))
         assert dream_a_while(site.centre, time.sleep, lambda: False)
-    assert jobs.get(row["id"])["state"] == "asked"
+    assert jobs.get(site.centre, Dream, row.id).state == "asked"
     assert nodes_of(site.centre.map_path(NAME)) == before
     assert dream_a_while(site.centre, time.sleep, lambda: False)
-    row = jobs.get(row["id"])
-    assert (row["state"], row["error"]) == ("done", None)
-    report = json.loads(row["report"])
+    row = jobs.get(site.centre, Dream, row.id)
+    assert (row.state, row.error) == ("done", None)
+    report = row.report
     assert report["better_by"][1] > 0
     assert before < nodes_of(site.centre.map_path(NAME))
     assert check_file(site.centre.map_path(NAME)).problems == ()
     with Map.open(site.centre.map_path(NAME)) as store:
-        assert row["revision"] == store.revision
+        assert row.revision == store.revision
     answer = site.http.get(f"/v1/maps/{NAME}/refs/stable", headers=site.token("viewer"))
-    assert answer.json()["revision"] == row["revision"]
+    assert answer.json()["revision"] == row.revision
     assert not dream_a_while(site.centre, time.sleep, lambda: False)
     site.close()
 
@@ -288,10 +285,10 @@ def test_a_better_order_becomes_a_revision_and_a_hand_in_interrupts(tmp_path, to
 def test_a_dream_whose_process_dies_is_told_to_have_failed(site, in_process, monkeypatch):
     handed_in(site, "r1", 1_000)
     judged(site)
-    row = Dreams(site.centre).ask(NAME, "tests")
+    row = dreams.ask(site.centre, NAME, "tests")
     monkeypatch.setattr(worker, "_dream_here", dies)
     assert dream_a_while(site.centre, time.sleep, lambda: False)
-    assert "exit code 1" in Dreams(site.centre).get(row["id"])["error"]
+    assert "exit code 1" in jobs.get(site.centre, Dream, row.id).error
 
 
 def dies(*_: object) -> None:

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
+from engram.fleet.centre import dreams
 from engram.fleet.centre.access import Role
-from engram.fleet.centre.app import create_app
-from engram.fleet.centre.jobs import Dreams
+from engram.fleet.centre.application import create_app
 from engram.maps.map import Map
 
 from .conftest import NAME, POLICY, Site, admit_here, drive
@@ -28,10 +28,10 @@ TAKES_THE_ROBOT = "DELETE /v1/maps/{name}/robots/{robot}"  # that the others ask
 @pytest.fixture(scope="module")
 def used(tmp_path_factory):
     """A centre with a robot, a hand-in, a download and a dream; what places in paths can name."""
-    from engram.fleet.centre import merging
+    from engram.fleet.centre import merge_job
 
     patch = pytest.MonkeyPatch()
-    patch.setattr(merging, "admit", admit_here)
+    patch.setattr(merge_job, "admit", admit_here)
     site = Site(tmp_path_factory.mktemp("fuzzed"))
     own = site.robot("r1")
     drive(own.live, "r1", 1_000)
@@ -51,7 +51,7 @@ def used(tmp_path_factory):
             "name": NAME,
             "handin": handin,
             "job": handin,
-            "dream": Dreams(site.centre).ask(NAME, "tests")["id"],
+            "dream": dreams.ask(site.centre, NAME, "tests").id,
             "artifact": asked["id"],
             "ref": "head",
             "robot": own.state.fact("robot"),

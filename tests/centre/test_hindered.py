@@ -9,24 +9,24 @@ import pytest
 from sqlalchemy import create_engine, text
 
 from engram.errors import EngramError, MapCorruptError, StorageFullError
-from engram.fleet.centre import jobs, merging, worker
+from engram.fleet.centre import downloads, handins, jobs, merge_job, worker
 from engram.fleet.centre.database import _errors
-from engram.fleet.centre.handins import HandIns
-from engram.fleet.centre.merging import KilledError
+from engram.fleet.centre.merge_job import KilledError
 from engram.fleet.centre.service import Centre
+from engram.fleet.centre.tables import HandIn
 
 from .conftest import NAME, POLICY, drive
 
 pytestmark = pytest.mark.usefixtures("in_process")
 
 
-def handed(site) -> dict:
+def handed(site) -> HandIn:
     """A complete hand-in."""
     agent = site.robot("r1")
     drive(agent.live, "r1", 1_000)
     agent.hand_in()
     agent.step()
-    return HandIns(site.centre).waiting(NAME)[0]
+    return jobs.pending(site.centre, HandIn, NAME)[0]
 
 
 def full(*_, **__):
@@ -36,14 +36,14 @@ def full(*_, **__):
 def test_a_hand_in_waits_for_a_full_disk_and_says_so(site, monkeypatch):
     row = handed(site)
     with monkeypatch.context() as patch:
-        patch.setattr(merging, "merge", full)
+        patch.setattr(merge_job, "merge", full)
         for _ in range(site.centre.settings.merge_tries + 1):
             with pytest.raises(EngramError, match=r"fleet: hand-in .* waits: no space is left"):
                 site.work()
-    row = HandIns(site.centre).get(row["id"])
-    assert (row["state"], row["progress"]) == ("complete", "waits: no space is left")
+    row = jobs.get(site.centre, HandIn, row.id)
+    assert (row.state, row.progress) == ("complete", "waits: no space is left")
     site.settle()
-    assert HandIns(site.centre).get(row["id"])["state"] == "merged"
+    assert jobs.get(site.centre, HandIn, row.id).state == "merged"
 
 
 def test_a_held_out_drive_that_is_gone_refuses_no_hand_in(site, tmp_path):
@@ -54,22 +54,23 @@ def test_a_held_out_drive_that_is_gone_refuses_no_hand_in(site, tmp_path):
         site.work()
     site.centre.set_policy(NAME, POLICY, "tests")
     site.work()
-    assert HandIns(site.centre).get(row["id"])["state"] == "merged"
+    assert jobs.get(site.centre, HandIn, row.id).state == "merged"
 
 
 def test_a_map_that_is_hindered_hinders_no_other(site, monkeypatch):
-    handed(site)
-    merged = []
+    row, merged = handed(site), []
 
     def of_one(centre, row):
-        if row["map"] == NAME:
-            raise merging.WaitsError("its disk is full")
-        merged.append(row["map"])
+        if row.map == NAME:
+            raise merge_job.WaitsError("its disk is full")
+        merged.append(row.map)
 
-    monkeypatch.setattr(merging, "merge_hand_in", of_one)
+    monkeypatch.setattr(merge_job, "merge_hand_in", of_one)
     site.centre.add_map("town", "tests", POLICY)
-    monkeypatch.setattr(HandIns, "waiting", lambda _, name: [{"map": name}])
-    with pytest.raises(merging.WaitsError):
+    with site.centre.database.writing() as connection:
+        in_town = replace(row, id="town", map="town", place=row.place + 1)
+        site.centre.database.add(connection, in_town)
+    with pytest.raises(merge_job.WaitsError):
         site.work()
     assert merged == ["town"]
 
@@ -83,10 +84,10 @@ def test_a_download_is_made_when_there_is_room_again(site, monkeypatch):
     robot.hand_in()
     robot.step()
     with monkeypatch.context() as patch:
-        patch.setattr(jobs, "download", full)
+        patch.setattr(downloads, "download", full)
         with pytest.raises(StorageFullError):
             site.work()
-    assert not HandIns(site.centre).waiting(NAME)  # a merge takes less room
+    assert not jobs.pending(site.centre, HandIn, NAME)  # a merge takes less room
     site.settle()
     assert robot.status()["staged"] is not None
 
@@ -97,20 +98,20 @@ def test_a_check_that_is_killed_is_made_again_but_not_for_ever(site, monkeypatch
     def killed(*_):
         raise KilledError("the check was killed")
 
-    monkeypatch.setattr(merging, "admit", killed)
+    monkeypatch.setattr(merge_job, "admit", killed)
     for _ in range(site.centre.settings.merge_tries):
         with pytest.raises(EngramError, match="waits: the check was killed"):
             site.work()
     site.work()
-    row = HandIns(site.centre).get(row["id"])
-    assert row["state"] == "failed"
-    assert "died 3 times; an operator may have it merged anyway" in row["error"]
+    row = jobs.get(site.centre, HandIn, row.id)
+    assert row.state == "failed"
+    assert "died 3 times; an operator may have it merged anyway" in row.error
 
 
 def test_two_workers_do_not_make_the_same_download(site, monkeypatch):
     handed(site)
     site.work()
-    robot, real, made = site.robot("r2"), jobs.download, []
+    robot, real, made = site.robot("r2"), downloads.download, []
     robot.step()
 
     def beside_another_worker(*given, **options):
@@ -118,7 +119,7 @@ def test_two_workers_do_not_make_the_same_download(site, monkeypatch):
         assert site.work() == 0
         return real(*given, **options)
 
-    monkeypatch.setattr(jobs, "download", beside_another_worker)
+    monkeypatch.setattr(downloads, "download", beside_another_worker)
     site.work()
     assert len(made) == 1
     site.settle()
@@ -127,17 +128,17 @@ def test_two_workers_do_not_make_the_same_download(site, monkeypatch):
 
 def test_a_worker_goes_on_after_what_hindered_it_and_tells_it(site, monkeypatch, caplog):
     row, waits = handed(site), []
-    monkeypatch.setattr(merging, "merge", full)
+    monkeypatch.setattr(merge_job, "merge", full)
 
     def wait(seconds):
         waits.append(seconds)
         monkeypatch.undo()
 
-    monkeypatch.setattr(merging, "admit", lambda *_: full())
-    monkeypatch.setattr(worker.work_off, "__defaults__", (merging.merge_hand_in,))
+    monkeypatch.setattr(merge_job, "admit", lambda *_: full())
+    monkeypatch.setattr(worker.work_off, "__defaults__", (merge_job.merge_hand_in,))
     worker.work(site.centre, wait, lambda: len(waits) == 1)
     assert waits == [worker._AGAIN_S]
-    assert f"hand-in {row['id'][:8]} waits: no space is left; tried again in" in caplog.text
+    assert f"hand-in {row.id[:8]} waits: no space is left; tried again in" in caplog.text
 
 
 def test_a_full_disk_of_the_tables_is_told_apart():
@@ -180,10 +181,10 @@ def test_a_hand_in_that_expired_is_open_again_when_its_robot_is_back(site):
     agent.hand_in()
     site.link.fates = ["well", "well", "well", "well", "lost"]  # begun, and no part arrives
     agent.step()
-    (row,) = HandIns(site.centre).listed(NAME, None, None, 2**62, 2)
-    assert row["state"] == "open"
+    (row,) = handins.listed(site.centre, NAME)
+    assert row.state == "open"
     site.clock.forward(15 * 86_400)
     site.work()
-    assert HandIns(site.centre).get(row["id"])["state"] == "cancelled"
+    assert jobs.get(site.centre, HandIn, row.id).state == "cancelled"
     site.settle()
-    assert HandIns(site.centre).get(row["id"])["state"] == "merged"
+    assert jobs.get(site.centre, HandIn, row.id).state == "merged"

@@ -11,10 +11,10 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
-from engram.fleet.centre import merging
-from engram.fleet.centre.handins import HandIns
-from engram.fleet.centre.service import CentreSettings, HandInState
+from engram.fleet.centre import handins, merge_job
+from engram.fleet.centre.service import CentreSettings
 from engram.fleet.centre.serving import back_up
+from engram.fleet.centre.tables import JobState
 from engram.fleet.centre.worker import sweep
 from engram.fleet.merge.merging import merge
 from engram.maps.map import Map
@@ -36,7 +36,7 @@ class FleetMachine(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.folder = Path(tempfile.mkdtemp())
-        self.admit, merging.admit = merging.admit, admit_here
+        self.admit, merge_job.admit = merge_job.admit, admit_here
         # Nothing that is needed no more is kept for a while.
         self.site = Site(self.folder, settings=CentreSettings(kept_days=0))
         self.drives: set[tuple[str, int]] = set()
@@ -114,7 +114,7 @@ class FleetMachine(RuleBasedStateMachine):
             self.nothing_is_lost_or_done_twice()
         finally:
             self.site.close()
-            merging.admit = self.admit
+            merge_job.admit = self.admit
             shutil.rmtree(self.folder)
 
     def nothing_is_lost_or_done_twice(self) -> None:
@@ -127,9 +127,9 @@ class FleetMachine(RuleBasedStateMachine):
                     self.copies.setdefault(store.content_hash(), copy)
             agent.hand_in()
         self.site.settle()
-        rows = HandIns(self.site.centre).listed(NAME, None, None, 2**62, 1000)
-        assert {row["state"] for row in rows} <= {HandInState.MERGED}
-        merged = sorted(rows, key=lambda row: row["place"])
+        rows = handins.listed(self.site.centre, NAME)
+        assert {row.state for row in rows} <= {JobState.MERGED}
+        merged = sorted(rows, key=lambda row: row.place)
         place = self.site.centre.map_path(NAME)
         assert check_file(place).problems == ()
         with Map.open(place) as store:
@@ -138,7 +138,7 @@ class FleetMachine(RuleBasedStateMachine):
         assert seen == self.drives
         if not merged:
             return
-        files = [self.copies[row["content_hash"]] for row in merged]
+        files = [self.copies[row.content_hash] for row in merged]
         (self.folder / "files").mkdir()
         merge(self.folder / "files" / "fleet.engram", files, POLICY.merge)
         with Map.open(self.folder / "files" / "fleet.engram") as store:

@@ -10,9 +10,8 @@ import msgspec
 import pytest
 
 from engram.errors import EngramError, MapCorruptError, MapLockedError
-from engram.fleet.centre import jobs
-from engram.fleet.centre.handins import HandIns
-from engram.fleet.centre.merging import admit
+from engram.fleet.centre import downloads, handins, jobs
+from engram.fleet.centre.merge_job import admit
 from engram.fleet.centre.service import CentreSettings
 from engram.fleet.transfers import Manifest, bundle, part_hash, split
 from engram.maps.map import Map
@@ -82,10 +81,10 @@ def test_mutated_pages_and_blobs_never_reach_the_map(site, robot):
         answer = send(site, robot, *swapped(manifest, parts, old, bytes(body)))
         assert answer.status_code in {200, 409, 422, 429}
         site.work()
-        for row in HandIns(site.centre).listed(NAME, None, "open", 2**62, 10):
-            HandIns(site.centre).cancel(row, "tests")
-        assert not HandIns(site.centre).listed(NAME, None, "merged", 2**62, 10), bytes(body)
-    states = {row["state"] for row in HandIns(site.centre).listed(NAME, None, None, 2**62, 100)}
+        for row in handins.listed(site.centre, NAME, state="open"):
+            jobs.cancel(site.centre, row, "tests")
+        assert not handins.listed(site.centre, NAME, state="merged"), bytes(body)
+    states = {row.state for row in handins.listed(site.centre, NAME)}
     assert states <= {"failed", "cancelled"}
     assert site.content() == before
     assert check_file(site.centre.map_path(NAME)).problems == ()
@@ -191,7 +190,7 @@ def test_admission_ends_at_its_limits(tmp_path, robot):
 def test_admission_runs_under_a_lower_limit_of_the_system():
     """With ``ulimit -f`` below its own it failed every hand-in, in words of time and memory."""
     code = (
-        "import resource as r; from engram.fleet.centre.merging import confine; "
+        "import resource as r; from engram.fleet.centre.merge_job import confine; "
         "r.setrlimit(r.RLIMIT_FSIZE, (2**20, 2**20)); confine(2**33, 60, 2**26); "
         "print(r.getrlimit(r.RLIMIT_FSIZE), r.getrlimit(r.RLIMIT_CPU))"
     )
@@ -201,28 +200,28 @@ def test_admission_runs_under_a_lower_limit_of_the_system():
 
 def test_what_the_gate_refuses_stays_and_a_person_may_merge_it(site, robot, monkeypatch):
     from engram.errors import RefusedError
-    from engram.fleet.centre import merging
+    from engram.fleet.centre import merge_job
 
-    real = merging.merge
+    real = merge_job.merge
 
     def refusing(*arguments, require_better=(), **options):
         if require_better:
             raise RefusedError("held-out localises worse")
         return real(*arguments, **options)
 
-    monkeypatch.setattr(merging, "merge", refusing)
+    monkeypatch.setattr(merge_job, "merge", refusing)
     policy = site.centre.policy(NAME)
     site.centre.set_policy(NAME, type(policy)(policy.merge, ("held-out.framelog",), "stable"), "t")
     robot.hand_in()
     site.settle()
-    (row,) = HandIns(site.centre).listed(NAME, None, None, 2**62, 10)
-    assert (row["state"], row["error"]) == ("refused", "held-out localises worse")
+    (row,) = handins.listed(site.centre, NAME)
+    assert (row.state, row.error) == ("refused", "held-out localises worse")
     operator = site.token("operator")
-    answer = site.http.post(f"/v1/handins/{row['id']}/merge", headers=operator)
+    answer = site.http.post(f"/v1/handins/{row.id}/merge", headers=operator)
     assert answer.json()["state"] == "complete"
     site.settle()
-    (row,) = HandIns(site.centre).listed(NAME, None, None, 2**62, 10)
-    assert (row["state"], row["revision"]) == ("merged", 1)
+    (row,) = handins.listed(site.centre, NAME)
+    assert (row.state, row.revision) == ("merged", 1)
     refs = site.http.get(f"/v1/maps/{NAME}/refs", headers=operator).json()
     assert [one["name"] for one in refs] == ["head"]  # what a person forced moves no ref
 
@@ -234,7 +233,7 @@ def test_an_error_names_no_place_on_the_centres_machine(site, robot, monkeypatch
     def locked(*_, **__):
         raise MapLockedError(f"{site.centre.map_path(NAME)} is locked")
 
-    monkeypatch.setattr(jobs, "download", locked)
+    monkeypatch.setattr(downloads, "download", locked)
     asked = {"options": {"thumbnails": False}}
     row = robot.link.ask("POST", f"/v1/maps/{NAME}/downloads", asked)
     site.work()
@@ -260,7 +259,7 @@ def test_what_stays_incomplete_or_unused_goes(site, robot):
     site.work()
     site.clock.forward(31 * 86_400)
     site.work()
-    assert not HandIns(site.centre).listed(NAME, None, "open", 2**62, 10)
+    assert not handins.listed(site.centre, NAME, state="open")
     assert site.http.get(f"/v1/artifacts/{key}", headers=viewer).status_code == 404
     assert list(site.centre.objects.keys("artifacts")) == []
     assert site.http.post(url, json=asked, headers=viewer).json()["state"] == "asked"
@@ -269,10 +268,10 @@ def test_what_stays_incomplete_or_unused_goes(site, robot):
 def test_a_job_can_be_cancelled_before_and_within(site, robot):
     robot.hand_in()
     robot.step()
-    (row,) = HandIns(site.centre).listed(NAME, None, None, 2**62, 10)
-    HandIns(site.centre).cancel(row, "tests")
+    (row,) = handins.listed(site.centre, NAME)
+    jobs.cancel(site.centre, row, "tests")
     site.work()
-    (row,) = HandIns(site.centre).listed(NAME, None, None, 2**62, 10)
-    assert (row["state"], row["revision"]) == ("cancelled", None)
+    (row,) = handins.listed(site.centre, NAME)
+    assert (row.state, row.revision) == ("cancelled", None)
     with Map.open(site.centre.map_path(NAME)) as store:
         assert store.revision == 0

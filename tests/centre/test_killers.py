@@ -10,8 +10,8 @@ from contextlib import closing
 
 import pytest
 
-from engram.fleet.centre import merging
-from engram.fleet.centre.handins import HandIns
+from engram.fleet.centre import handins, jobs, merge_job
+from engram.fleet.centre.tables import HandIn
 from engram.fleet.centre.worker import work, work_off
 from engram.maps.map import Map
 from engram.maps.rows import sealed
@@ -20,18 +20,18 @@ from engram.maps.schema import sessions
 from .conftest import NAME, drive
 
 
-def handed(site, robot: str, start_ns: int = 1_000) -> dict:
+def handed(site, robot: str, start_ns: int = 1_000) -> HandIn:
     """A complete hand-in of a robot."""
     agent = site.robot(robot)
     drive(agent.live, robot, start_ns)
     agent.hand_in()
     agent.step()
-    return HandIns(site.centre).waiting(NAME)[-1]
+    return jobs.pending(site.centre, HandIn, NAME)[-1]
 
 
-def state_of(site, row: dict) -> tuple[str, str | None]:
-    found = HandIns(site.centre).get(row["id"])
-    return found["state"], found["error"]
+def state_of(site, row: HandIn) -> tuple[str, str | None]:
+    found = jobs.get(site.centre, HandIn, row.id)
+    return found.state, found.error
 
 
 def end_by_signal(pipe, folder, addresses, settings, key) -> None:
@@ -59,7 +59,7 @@ def end_by_exit(pipe, folder, addresses, settings, key) -> None:
 def test_what_kills_its_process_is_not_taken_again_without_an_operator(site, monkeypatch, end, how):
     killer = handed(site, "r1")
     with monkeypatch.context() as patch:
-        patch.setattr(merging, "_merge", end)
+        patch.setattr(merge_job, "_merge", end)
         assert work_off(site.centre) == 1
         state, error = state_of(site, killer)
         assert state == "failed"
@@ -68,7 +68,7 @@ def test_what_kills_its_process_is_not_taken_again_without_an_operator(site, mon
         )
         assert list((site.centre.folder / "work").iterdir()) == []
         assert work_off(site.centre) == 0
-        HandIns(site.centre).merge_anyway(HandIns(site.centre).get(killer["id"]), "operator")
+        handins.merge_anyway(site.centre, jobs.get(site.centre, HandIn, killer.id), "operator")
         assert work_off(site.centre) == 1
         assert state_of(site, killer)[0] == "failed"
     other = handed(site, "r2", 5_000)
@@ -87,7 +87,7 @@ def test_whatever_is_raised_over_a_hand_in_ends_that_one_alone(site, monkeypatch
         raise fault("x" * 10_000)
 
     with monkeypatch.context() as patch:
-        patch.setattr(merging, "merge", raising)
+        patch.setattr(merge_job, "merge", raising)
         site.work()
     state, error = state_of(site, killer)
     assert state == "failed"
@@ -147,9 +147,9 @@ def test_sessions_of_strange_zones_and_names_harm_nobody(site, kind):
     agent.hand_in()
     agent.step()
     site.work()
-    rows = HandIns(site.centre).listed(NAME, None, None, 2**62, 10)
+    rows = handins.listed(site.centre, NAME)
     # A map that Engram cannot read leaves its robot in no whole hand-in, either.
-    assert [row["state"] for row in rows] == [expected] or (expected == "failed" and not rows)
+    assert [row.state for row in rows] == [expected] or (expected == "failed" and not rows)
     other = handed(site, "r2", 5_000)
     site.work()
     assert state_of(site, other)[0] == "merged"

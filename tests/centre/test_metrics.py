@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from engram.fleet.centre import app as application
-from engram.fleet.centre.app import create_app
+from engram.fleet.centre import application
+from engram.fleet.centre.application import create_app
 
 
 @pytest.mark.parametrize(("link_s", "own_s", "within"), [(100.0, 0.02, 0.05), (0.0, 3.0, 5.0)])

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from engram.errors import MapError
-from engram.fleet.centre.errors import StoreError
 from engram.fleet.centre.objects import BucketObjects, FolderObjects
+from engram.fleet.centre.problems import StoreError
 
 
 @pytest.fixture(params=["folder", "bucket", "s3"])

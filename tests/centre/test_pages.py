@@ -7,7 +7,7 @@ import re
 import pytest
 
 from engram.fleet.agent.link import enrol
-from engram.fleet.centre import merging
+from engram.fleet.centre import merge_job
 from engram.fleet.centre.access import Role, add_person, new_code
 
 from .conftest import KINDS, NAME, admit_here, drive, opened_site
@@ -22,7 +22,7 @@ def visited(request, tmp_path_factory):
         pytest.MonkeyPatch.context() as patch,
         opened_site(request, tmp_path_factory.mktemp("pages")) as site,
     ):
-        patch.setattr(merging, "admit", admit_here)
+        patch.setattr(merge_job, "admit", admit_here)
         evil = site.robot("<script>x</script>")
         drive(evil.live, "<img src=x>", 1_000)
         evil.hand_in()

@@ -9,8 +9,8 @@ from sqlalchemy import update
 
 from engram.cli.settings import AllSettings
 from engram.errors import FormatVersionError
-from engram.fleet.centre.database import centre
 from engram.fleet.centre.service import Centre, MapPolicy
+from engram.fleet.centre.tables import centre
 from engram.fleet.merge.settings import MergeOptions
 
 from .conftest import drive

@@ -69,7 +69,7 @@ def test_a_download_that_cannot_be_made_ends_at_once_with_its_reason(
     def refuse(*_: object, **__: object) -> None:
         raise EngramError("no such hour")
 
-    monkeypatch.setattr("engram.fleet.centre.jobs.download", refuse)
+    monkeypatch.setattr("engram.fleet.centre.downloads.download", refuse)
     robot = town.robot("r1", 1_000)
     robot.hand_in("first")
     with pytest.raises(EngramError, match=r"r1 downloads, copy: .*no such hour"):
@@ -82,7 +82,7 @@ def test_a_hand_in_that_cannot_be_merged_ends_at_once_with_its_reason(
     def refuse(*_: object) -> None:
         raise EngramError("no such thing")
 
-    monkeypatch.setattr("engram.fleet.centre.merging.admit", refuse)
+    monkeypatch.setattr("engram.fleet.centre.merge_job.admit", refuse)
     with pytest.raises(EngramError, match=r"the centre merges r1's first foray: no such thing"):
         town.robot("r1", 1_000).hand_in("first")
 

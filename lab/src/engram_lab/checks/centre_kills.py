@@ -33,9 +33,9 @@ from engram.fleet.agent.agent import Agent
 from engram.fleet.agent.link import enrol
 from engram.fleet.agent.outbox import QUEUED, SENT
 from engram.fleet.agent.state import AgentSettings
+from engram.fleet.centre import handins
 from engram.fleet.centre.access import new_code
 from engram.fleet.centre.database import first_broken
-from engram.fleet.centre.handins import HandIns
 from engram.fleet.centre.service import Centre
 from engram.fleet.centre.serving import Listening, run_worker, serve
 from engram.fleet.merge.merging import merge
@@ -52,7 +52,7 @@ _NODES = 4
 _LOADED = [
     __name__,
     "uvicorn.protocols.http.auto",
-    "engram.fleet.centre.app",
+    "engram.fleet.centre.application",
     "engram.fleet.download",
 ]
 _LOOK_S = 0.05
@@ -165,8 +165,8 @@ class Fleet:
     def settled(self) -> int:
         """How many hand-ins have ended."""
         with Centre(self._folder / "centre") as centre:
-            rows = HandIns(centre).listed(_MAP, None, None, 2**62, 10**6)
-        return sum(row["ended_ns"] is not None for row in rows)
+            rows = handins.listed(centre, _MAP)
+        return sum(row.ended_ns is not None for row in rows)
 
     def end_day(self) -> None:
         """Until every robot has handed in all that it drove, without further kills."""
@@ -245,16 +245,14 @@ def one_day(folder: Path, number: int, kills: int, pause_s: float, seed: int = 0
 def faults(folder: Path, day: Day) -> Iterator[str]:
     """What is lost, was done twice, or differs from merging the files."""
     with Centre(folder / "centre") as centre:
-        rows = HandIns(centre).listed(_MAP, None, None, 2**62, 10**6)
+        rows = handins.listed(centre, _MAP)
         place = centre.map_path(_MAP)
         with centre.database.reading() as connection:
             broken = first_broken(connection)
     day.handins = len(rows)
     if broken is not None:
         yield f"audit log changed at row {broken}"
-    yield from (
-        f"hand-in {row['id']} is {row['state']}" for row in rows if row["state"] != "merged"
-    )
+    yield from (f"hand-in {row.id} is {row.state}" for row in rows if row.state != "merged")
     driven = set[tuple[str, int]]()
     for path in (place, *(folder / name / "live" / "map.engram" for name in _ROBOTS)):
         yield from (f"{path.parent.parent.name}: {one}" for one in check_file(path).problems)
@@ -269,8 +267,8 @@ def faults(folder: Path, day: Day) -> Iterator[str]:
         yield f"{len(driven)} drives, {len(held)} in the fleet map"
     if len(set(sources)) != len(sources):
         yield "a hand-in made two revisions"
-    merged = sorted((row for row in rows if row["state"] == "merged"), key=lambda row: row["place"])
-    files = [folder / "copies" / f"{row['content_hash']}.engram" for row in merged]
+    merged = sorted((row for row in rows if row.state == "merged"), key=lambda row: row.place or 0)
+    files = [folder / "copies" / f"{row.content_hash}.engram" for row in merged]
     merge(folder / "files.engram", files, MergeOptions(relocaliser="none"))
     with Map.open(folder / "files.engram") as store:
         if store.content_hash() != content:

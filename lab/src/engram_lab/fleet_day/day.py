@@ -231,7 +231,7 @@ def listening(centre: Centre) -> Iterator[int]:
     """Serves a centre on a free port of this machine, without a worker."""
     import uvicorn
 
-    from engram.fleet.centre.app import create_app
+    from engram.fleet.centre.application import create_app
 
     config = uvicorn.Config(
         create_app(centre), log_level="error", timeout_graceful_shutdown=_FAREWELL_S

@@ -15,7 +15,7 @@ from engram.fleet.agent.agent import MAP, Agent
 from engram.fleet.agent.link import Unreachable
 from engram.fleet.agent.outbox import QUEUED, SENT
 from engram.fleet.agent.state import AgentSettings
-from engram.fleet.centre.merging import merge_hand_in
+from engram.fleet.centre.merge_job import merge_hand_in
 from engram.fleet.centre.service import Centre
 from engram.fleet.centre.worker import work_off
 from engram.geometry.se3 import SE3

@@ -13,10 +13,10 @@ from fastapi.testclient import TestClient
 
 from engram.fleet.agent.agent import Agent
 from engram.fleet.agent.link import enrol
+from engram.fleet.centre import handins, jobs
 from engram.fleet.centre.access import new_code
-from engram.fleet.centre.app import create_app
-from engram.fleet.centre.handins import HandIns
-from engram.fleet.centre.merging import merge_hand_in
+from engram.fleet.centre.application import create_app
+from engram.fleet.centre.merge_job import merge_hand_in
 from engram.fleet.centre.service import Centre, CentreSettings, MapPolicy
 from engram.fleet.centre.worker import work_off
 from engram.fleet.merge.settings import MergeOptions
@@ -141,14 +141,14 @@ class Site:
         )
         chance.choice(kinds)(chance)
         work_off(self.centre, merge_hand_in)
-        for row in HandIns(self.centre).listed(_MAP, None, "open", 2**62, 10):
-            if row["robot"] == self._thief.state.fact("robot"):
-                HandIns(self.centre).cancel(row, "lab")
+        for row in handins.listed(self.centre, _MAP, state="open"):
+            if row.robot == self._thief.state.fact("robot"):
+                jobs.cancel(self.centre, row, "lab")
 
     def states(self) -> Counter[str]:
         """Results of the hand-ins."""
-        rows = HandIns(self.centre).listed(_MAP, None, None, 2**62, 100_000)
-        return Counter(row["state"] for row in rows)
+        rows = handins.listed(self.centre, _MAP)
+        return Counter(row.state for row in rows)
 
     def faults(self) -> list[str]:
         """What is wrong with the map, or was left behind."""

@@ -16,7 +16,7 @@ from engram.calibration.toml import CalibrationFile, calibration_toml
 from engram.cli.settings import read_settings
 from engram.config import load_toml
 from engram.errors import EngramError
-from engram.fleet.centre.merging import write_checked
+from engram.fleet.centre.merge_job import write_checked
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.settings import MergeOptions
 from engram.fleet.transfers import Manifest, decode_manifest, split

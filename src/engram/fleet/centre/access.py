@@ -9,26 +9,29 @@ from __future__ import annotations
 import hashlib
 import secrets
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from sqlalchemy import Connection, delete, select, update
+from sqlalchemy import Connection, delete, update
 
 from engram.errors import InputError
-from engram.fleet.centre.database import (
+from engram.fleet.centre.database import first_row, note, rows_of
+from engram.fleet.centre.fleet import check_followed
+from engram.fleet.centre.problems import NotAllowedError, NotKnownError, UnknownError
+from engram.fleet.centre.service import DAY_NS, Centre
+from engram.fleet.centre.tables import (
+    Account,
+    EnrolmentCode,
+    Grant,
+    Nonce,
+    RobotOnMap,
+    Token,
     codes,
-    first_row,
     grants,
     nonces,
-    note,
-    robots,
-    rows_of,
     subjects,
     tokens,
 )
-from engram.fleet.centre.errors import NotAllowedError, NotKnownError, UnknownError
-from engram.fleet.centre.fleet import check_followed
-from engram.fleet.centre.service import DAY_NS, Centre
 from engram.fleet.transfers import check_signature, enrolment_text, token_text
 
 ALL_MAPS = "*"
@@ -80,7 +83,7 @@ class Subject:
         role = self.role_on(name)
         if role is None:
             raise UnknownError(f"you have no access to a map {name!r:.60}")
-        if not any(role in _INCLUDES[one] for one in roles):
+        if not any(role in _INCLUDES[wanted] for wanted in roles):
             raise NotAllowedError(
                 f"a role of {role} may not do this; it needs {' or '.join(roles)}"
             )
@@ -100,14 +103,9 @@ def new_code(centre: Centre, name: str, follows: str, by: str) -> str:
     code = secrets.token_hex(12)  # on a command line: a first - would be an option
     now = centre.now_ns()
     with centre.database.writing() as connection:
-        row = {
-            "hash": _hash(code),
-            "map": name,
-            "follows": follows,
-            "expires_ns": now + centre.settings.code_days * DAY_NS,
-            "used_by": None,
-        }
-        centre.database.add(connection, codes, [row])
+        expires_ns = now + centre.settings.code_days * DAY_NS
+        row = EnrolmentCode(_hash(code), name, follows, expires_ns, used_by=None)
+        centre.database.add(connection, row)
         note(connection, now, by, "code", name, follows=follows)
     return code
 
@@ -123,49 +121,22 @@ def enrol(centre: Centre, code: str, name: str, public_key: bytes, signature: by
     check_signature(public_key, signature, enrolment_text(code))
     robot, now = hashlib.sha256(public_key).hexdigest()[:32], centre.now_ns()
     with centre.database.writing() as connection:
-        row = first_row(connection, select(codes).where(codes.c.hash == _hash(code)))
-        gone = select(subjects.c.id).where(subjects.c.id == robot, subjects.c.disabled != 0)
-        if connection.execute(gone).first() is not None:
+        row = first_row(connection, EnrolmentCode, codes.c.hash == _hash(code))
+        known = first_row(connection, Account, subjects.c.id == robot)
+        if known is not None and known.disabled:
             raise NotAllowedError("this robot was removed; enrol it again from a new folder")
-        if row is None or row["expires_ns"] < now or row["used_by"] not in {None, robot}:
+        if row is None or row.expires_ns < now or row.used_by not in {None, robot}:
             raise NotAllowedError("the code is unknown, expired or used; ask for a new one")
-        if row["used_by"] is None:
-            connection.execute(
-                update(codes).where(codes.c.hash == row["hash"]).values(used_by=robot)
-            )
-            _add_robot(centre, connection, robot, name, public_key, row)
-            connection.execute(update(subjects).where(subjects.c.id == robot).values(name=name))
-            note(connection, now, robot, "enrol", row["map"], name=name)
+        if row.used_by is None:
+            put = centre.database.put
+            put(connection, replace(row, used_by=robot))
+            account = known or Account(robot, "robot", name, public_key, now, disabled=0)
+            put(connection, replace(account, name=name))
+            put(connection, Grant(robot, row.map, Role.ROBOT))
+            on_map = RobotOnMap(robot, row.map, row.follows, report={}, reported_ns=None)
+            centre.database.add(connection, on_map)
+            note(connection, now, robot, "enrol", row.map, name=name)
         return _subject(connection, robot)
-
-
-def _add_robot(
-    centre: Centre,
-    connection: Connection,
-    robot: str,
-    name: str,
-    public_key: bytes,
-    code: dict[str, object],
-) -> None:
-    known = {
-        "id": robot,
-        "kind": "robot",
-        "name": name,
-        "public_key": public_key,
-        "created_ns": centre.now_ns(),
-        "disabled": 0,
-    }
-    centre.database.add(connection, subjects, [known])
-    grant = {"subject": robot, "map": code["map"], "role": str(Role.ROBOT)}
-    centre.database.put(connection, grants, grant)
-    state = {
-        "robot": robot,
-        "map": code["map"],
-        "follows": code["follows"],
-        "report": "{}",
-        "reported_ns": None,
-    }
-    centre.database.add(connection, robots, [state])
 
 
 def new_nonce(centre: Centre, robot: str) -> str:
@@ -173,11 +144,9 @@ def new_nonce(centre: Centre, robot: str) -> str:
     nonce, now = secrets.token_hex(16), centre.now_ns()
     with centre.database.writing(durable=False) as connection:
         connection.execute(delete(nonces).where(nonces.c.expires_ns < now))
-        known = first_row(connection, select(subjects.c.id).where(subjects.c.id == robot))
-        if known is not None:
+        if first_row(connection, Account, subjects.c.id == robot) is not None:
             expires_ns = now + centre.settings.nonce_s * _S
-            row = {"nonce": nonce, "subject": robot, "expires_ns": expires_ns}
-            centre.database.add(connection, nonces, [row])
+            centre.database.add(connection, Nonce(nonce, robot, expires_ns))
     return nonce
 
 
@@ -190,17 +159,17 @@ def new_token(centre: Centre, robot: str, nonce: str, signature: bytes) -> str:
     """
     now = centre.now_ns()
     with centre.database.writing(durable=False) as connection:
-        query = select(nonces).where(nonces.c.nonce == nonce, nonces.c.subject == robot)
-        row = first_row(connection, query)
+        of_robot = (nonces.c.nonce == nonce, nonces.c.subject == robot)
+        row = first_row(connection, Nonce, *of_robot)
         connection.execute(delete(nonces).where(nonces.c.nonce == nonce))
-        known = first_row(connection, select(subjects).where(subjects.c.id == robot))
+        known = first_row(connection, Account, subjects.c.id == robot)
     refused = NotAllowedError(
         "no token: the robot is unknown here, was removed, or signed an expired nonce"
     )
-    if row is None or row["expires_ns"] < now or known is None or known["disabled"]:
+    if row is None or row.expires_ns < now or known is None or known.disabled:
         raise refused
     try:
-        check_signature(known["public_key"] or b"", signature, token_text(robot, nonce))
+        check_signature(known.public_key or b"", signature, token_text(robot, nonce))
     except InputError as error:
         raise refused from error
     return _issue(centre, robot, now + centre.settings.token_s * _S)
@@ -219,17 +188,9 @@ def add_person(centre: Centre, name: str, map_name: str, role: Role) -> str:
         centre.map_row(map_name)
     person, now = secrets.token_hex(16), centre.now_ns()
     with centre.database.writing() as connection:
-        known = {
-            "id": person,
-            "kind": "person",
-            "name": name,
-            "public_key": None,
-            "created_ns": now,
-            "disabled": 0,
-        }
-        centre.database.add(connection, subjects, [known])
-        grant = {"subject": person, "map": map_name, "role": str(role)}
-        centre.database.put(connection, grants, grant)
+        account = Account(person, "person", name, public_key=None, created_ns=now, disabled=0)
+        centre.database.add(connection, account)
+        centre.database.put(connection, Grant(person, map_name, role))
         note(connection, now, "shell", "token", map_name, name=name, role=str(role))
     return _issue(centre, person, None)
 
@@ -241,11 +202,10 @@ def subject_of(centre: Centre, token: str) -> Subject:
         NotKnownError: the token is unknown, or has expired.
     """
     with centre.database.reading() as connection:
-        row = first_row(connection, select(tokens).where(tokens.c.hash == _hash(token)))
-        expired = row is not None and (row["expires_ns"] or 2**63) < centre.now_ns()
-        if row is None or expired:
+        row = first_row(connection, Token, tokens.c.hash == _hash(token))
+        if row is None or (row.expires_ns or 2**63) < centre.now_ns():
             raise NotKnownError("the token is not known or has expired; ask for a new one")
-        return _subject(connection, row["subject"])
+        return _subject(connection, row.subject)
 
 
 def disable(centre: Centre, robot: str, by: str) -> None:
@@ -256,7 +216,7 @@ def disable(centre: Centre, robot: str, by: str) -> None:
         note(connection, centre.now_ns(), by, "disable", "", robot=robot)
 
 
-def take_away(centre: Centre, name: str, by: str) -> list[str]:
+def revoke_access(centre: Centre, name: str, by: str) -> list[str]:
     """Revokes all tokens of every person of this name, or of the robot of this name or id.
 
     Returns:
@@ -266,40 +226,37 @@ def take_away(centre: Centre, name: str, by: str) -> list[str]:
         UnknownError: no person or robot has this name.
         InputError: several robots have it.
     """
-    called = (subjects.c.name == name) | (subjects.c.id == name)
-    with centre.database.reading() as connection:
-        found = rows_of(connection, select(subjects).where(called, subjects.c.disabled == 0))
-    alike = [one["id"] for one in found if one["kind"] == "robot"]
+    of_name = (subjects.c.name == name) | (subjects.c.id == name)
+    found = centre.database.rows(Account, of_name, subjects.c.disabled == 0)
+    alike = [account.id for account in found if account.kind == "robot"]
     if len(alike) > 1:
         raise InputError(f"{len(alike)} robots are called {name!r}; name one by its id: {alike}")
     if not found:
         raise UnknownError(f"{name!r:.60} has no token")
-    for one in found:
-        disable(centre, one["id"], by)
-    return [one["id"] for one in found]
+    for account in found:
+        disable(centre, account.id, by)
+    return [account.id for account in found]
 
 
 def names_of(centre: Centre) -> dict[str, str]:
     """Names of all robots and people, by id."""
-    with centre.database.reading() as connection:
-        return {row["id"]: row["name"] for row in rows_of(connection, select(subjects))}
+    return {account.id: account.name for account in centre.database.rows(Account)}
 
 
 def _issue(centre: Centre, subject: str, expires_ns: int | None) -> str:
     token = secrets.token_urlsafe(32)
     with centre.database.writing(durable=expires_ns is None) as connection:
         connection.execute(delete(tokens).where(tokens.c.expires_ns < centre.now_ns()))
-        row = {"hash": _hash(token), "subject": subject, "expires_ns": expires_ns}
-        centre.database.add(connection, tokens, [row])
+        centre.database.add(connection, Token(_hash(token), subject, expires_ns))
     return token
 
 
 def _subject(connection: Connection, found: str) -> Subject:
-    row = first_row(connection, select(subjects).where(subjects.c.id == found))
-    if row is None or row["disabled"]:
+    row = first_row(connection, Account, subjects.c.id == found)
+    if row is None or row.disabled:
         raise NotKnownError("the owner of this token is no longer known; ask for a new one")
-    held = rows_of(connection, select(grants).where(grants.c.subject == found))
-    return Subject(found, row["name"], {one["map"]: Role(one["role"]) for one in held})
+    held = rows_of(connection, Grant, grants.c.subject == found)
+    return Subject(found, row.name, {grant.map: Role(grant.role) for grant in held})
 
 
 def _hash(secret: str) -> bytes:

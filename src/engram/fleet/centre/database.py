@@ -1,4 +1,4 @@
-"""The service's database: its tables, SQLite or PostgreSQL, wake-ups, and the audit log.
+"""The service's database, SQLite or PostgreSQL: transactions, wake-ups, and the audit log.
 
 The audit log: every change of state, each row bound to the one before by a hash. It is the stream
 of events as well.
@@ -11,23 +11,17 @@ import json
 import logging
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from sqlalchemy import (
     URL,
-    BigInteger,
-    Column,
+    ColumnElement,
     Connection,
+    CursorResult,
     Engine,
-    Index,
-    Integer,
-    LargeBinary,
-    MetaData,
-    Select,
-    Table,
-    Text,
     create_engine,
     event,
     insert,
@@ -42,214 +36,20 @@ from sqlalchemy.exc import ArgumentError, DataError, DBAPIError
 
 from engram import PRE_RELEASE, __version__
 from engram.errors import FormatVersionError, InputError, MissingExtraError, StorageFullError
-from engram.fleet.centre.errors import StoreError
+from engram.fleet.centre.problems import StoreError
+from engram.fleet.centre.tables import (
+    TABLES,
+    VERSION,
+    Event,
+    Row,
+    Schema,
+    audit,
+    centre,
+    metadata,
+    subjects,
+    values_of,
+)
 from engram.sqlite import is_full
-
-VERSION = 3
-
-metadata = MetaData()
-_INT = BigInteger().with_variant(Integer(), "sqlite")
-
-
-def _int(name: str, **given: Any) -> Column[int]:
-    return Column(name, _INT, nullable=given.pop("nullable", False), **given)
-
-
-def _text(name: str, **given: Any) -> Column[str]:
-    return Column(name, Text(), nullable=given.pop("nullable", False), **given)
-
-
-def _bytes(name: str, **given: Any) -> Column[bytes]:
-    return Column(name, LargeBinary(), nullable=given.pop("nullable", False), **given)
-
-
-centre = Table("centre", metadata, _int("key", primary_key=True), _int("version"))
-
-maps = Table(
-    "maps",
-    metadata,
-    _text("name", primary_key=True),
-    _int("created_ns"),
-    _int("durable_revision"),  # the newest that a backup holds
-    _text("options"),  # MapPolicy as JSON
-)
-
-refs = Table(
-    "refs",
-    metadata,
-    _text("map", primary_key=True),
-    _text("name", primary_key=True),
-    _int("revision"),
-    _int("version"),  # counts its moves: the ETag
-    _int("moved_ns"),
-    _text("moved_by"),
-)
-
-subjects = Table(
-    "subjects",
-    metadata,
-    _text("id", primary_key=True),
-    _text("kind"),  # robot or person
-    _text("name"),
-    _bytes("public_key", nullable=True),
-    _int("created_ns"),
-    _int("disabled"),
-)
-
-grants = Table(
-    "grants",
-    metadata,
-    _text("subject", primary_key=True),
-    _text("map", primary_key=True),  # "*" for all
-    _text("role"),
-)
-
-codes = Table(
-    "codes",
-    metadata,
-    _bytes("hash", primary_key=True),
-    _text("map"),
-    _text("follows"),
-    _int("expires_ns"),
-    _text("used_by", nullable=True),
-)
-
-nonces = Table(
-    "nonces",
-    metadata,
-    _text("nonce", primary_key=True),
-    _text("subject"),
-    _int("expires_ns"),
-)
-
-tokens = Table(
-    "tokens",
-    metadata,
-    _bytes("hash", primary_key=True),
-    _text("subject"),
-    _int("expires_ns", nullable=True),
-)
-
-robots = Table(  # a robot on a map
-    "robots",
-    metadata,
-    _text("robot", primary_key=True),
-    _text("map", primary_key=True),
-    _text("follows"),  # a ref, or the number of a revision
-    _text("report"),  # the last one, as JSON
-    _int("reported_ns", nullable=True),
-)
-
-packs = Table(
-    "packs",
-    metadata,
-    _text("id", primary_key=True),
-    _text("map"),
-    _int("size"),
-    _int("written_ns"),
-)
-
-parts = Table(
-    "parts",
-    metadata,
-    _text("map", primary_key=True),
-    _bytes("hash", primary_key=True),
-    _text("pack"),
-    _int("start"),
-    _int("size"),
-)
-
-given = Table(  # by whom a part was handed in: nothing is taken by its hash alone
-    "given",
-    metadata,
-    _text("map", primary_key=True),
-    _text("robot", primary_key=True),
-    _bytes("hash", primary_key=True),
-)
-
-handins = Table(
-    "handins",
-    metadata,
-    _text("id", primary_key=True),
-    _text("map"),
-    _text("robot"),
-    _text("manifest"),
-    _text("base", nullable=True),  # the manifest that it continues
-    _text("content_hash"),
-    _text("state"),
-    _int("bytes"),
-    _int("begun_ns"),
-    _int("place", nullable=True),  # in the order of completion
-    _int("ended_ns", nullable=True),
-    _int("revision", nullable=True),
-    _int("tries"),
-    _int("cancelled"),
-    _int("ungated"),  # a person merges it whatever the gate says
-    _text("progress"),
-    _text("report", nullable=True),
-    _text("error", nullable=True),
-    Index("handins_by_state", "map", "state"),
-)
-
-artifacts = Table(
-    "artifacts",
-    metadata,
-    _text("id", primary_key=True),
-    _text("map"),
-    _int("revision"),
-    _text("options"),
-    _text("state"),
-    _text("manifest", nullable=True),
-    _text("report", nullable=True),
-    _text("error", nullable=True),
-    _int("asked_ns"),
-    _int("used_ns"),
-    Index("artifacts_by_state", "state"),
-)
-
-artifact_grants = Table(
-    "artifact_grants",
-    metadata,
-    _text("artifact", primary_key=True),
-    _text("subject", primary_key=True),
-)
-
-dreams = Table(  # looks for a better map in what was handed in
-    "dreams",
-    metadata,
-    _text("id", primary_key=True),
-    _text("map"),
-    _text("state"),
-    _text("asked_by"),
-    _int("asked_ns"),
-    _int("ended_ns", nullable=True),
-    _int("since"),  # revision of the fleet map when it was asked for
-    _int("revision", nullable=True),  # that it made
-    _text("progress"),
-    _text("report", nullable=True),
-    _text("error", nullable=True),
-)
-
-usage = Table(
-    "usage",
-    metadata,
-    _text("subject", primary_key=True),
-    _int("day", primary_key=True),
-    _int("bytes"),
-)
-
-audit = Table(
-    "audit",
-    metadata,
-    Column("number", _INT, primary_key=True, autoincrement=False),
-    _int("at_ns"),
-    _text("subject"),
-    _text("action"),
-    _text("map"),
-    _text("detail"),
-    _text("hash"),  # over the row before and this one
-)
-
 
 _BUSY_S = 30.0
 # One writer at a time on PostgreSQL too: numbers of the audit and of completion have no gaps.
@@ -309,21 +109,42 @@ class ServiceDatabase:
         if durable and self._sqlite:
             self._log.sync()
 
-    def add(self, connection: Connection, table: Table, rows: list[dict[str, Any]]) -> int:
-        """Adds rows whose keys are new; returns how many."""
-        if not rows:
-            return 0
-        make = insert_sqlite if self._sqlite else insert_postgresql
-        statement = make(table).on_conflict_do_nothing()
-        return connection.execute(statement, rows).rowcount
+    def add(self, connection: Connection, row: object) -> bool:
+        """Adds a row if its key is new; returns whether it was."""
+        return self._insert(connection, type(row), values_of(row)).rowcount == 1
 
-    def put(self, connection: Connection, table: Table, row: Mapping[str, Any]) -> None:
+    def add_all(self, connection: Connection, rows: Sequence[object]) -> None:
+        """Adds those rows of one table whose keys are new."""
+        if rows:
+            self._insert(connection, type(rows[0]), [values_of(row) for row in rows])
+
+    def _insert(self, connection: Connection, kind: type, values: Any) -> CursorResult[Any]:
+        make = insert_sqlite if self._sqlite else insert_postgresql
+        return connection.execute(make(TABLES[kind]).on_conflict_do_nothing(), values)
+
+    def put(self, connection: Connection, row: object) -> None:
         """Adds a row, or replaces the one with its key."""
+        table, values = TABLES[type(row)], values_of(row)
         key = [column.name for column in table.primary_key.columns]
         make = insert_sqlite if self._sqlite else insert_postgresql
-        rest = {name: value for name, value in row.items() if name not in key}
-        statement = make(table).values(**row)
+        rest = {name: value for name, value in values.items() if name not in key}
+        statement = make(table).values(**values)
         connection.execute(statement.on_conflict_do_update(index_elements=key, set_=rest))
+
+    def rows(
+        self,
+        kind: type[Row],
+        *where: ColumnElement[bool],
+        order: Any = (),
+        limit: int | None = None,
+    ) -> list[Row]:
+        """Rows of a table; see `rows_of`."""
+        with self.reading() as connection:
+            return rows_of(connection, kind, *where, order=order, limit=limit)
+
+    def row(self, kind: type[Row], *where: ColumnElement[bool]) -> Row | None:
+        """The first row of a table to which the conditions apply; None if there is none."""
+        return next(iter(self.rows(kind, *where, limit=1)), None)
 
     def close(self) -> None:
         """Closes all connections."""
@@ -334,7 +155,7 @@ class ServiceDatabase:
         """Makes the tables in an empty database; refuses those of another version."""
         if not inspect(connection).has_table(centre.name):
             metadata.create_all(connection)
-            connection.execute(insert(centre).values(key=1, version=VERSION))
+            connection.execute(insert(centre).values(**values_of(Schema(1, VERSION))))
             return
         version = connection.execute(select(centre.c.version)).scalar_one()
         if version != VERSION:
@@ -346,14 +167,30 @@ class ServiceDatabase:
             )
 
 
-def rows_of(connection: Connection, query: Select[Any]) -> list[dict[str, Any]]:
-    """The rows of a select as dicts."""
-    return [dict(row) for row in connection.execute(query).mappings()]
+def rows_of(
+    connection: Connection,
+    kind: type[Row],
+    *where: ColumnElement[bool],
+    order: Any = (),
+    limit: int | None = None,
+) -> list[Row]:
+    """The rows of a table to which all conditions apply.
+
+    Args:
+        connection: a connection.
+        kind: the class of the rows.
+        *where: conditions.
+        order: by which they are sorted: columns.
+        limit: how many at most; None for all.
+    """
+    columns = order if isinstance(order, tuple) else (order,)
+    query = select(TABLES[kind]).where(*where).order_by(*columns).limit(limit)
+    return [kind(*row) for row in connection.execute(query)]
 
 
-def first_row(connection: Connection, query: Select[Any]) -> dict[str, Any] | None:
-    """The first row of a select; None if there is none."""
-    return next(iter(rows_of(connection, query.limit(1))), None)
+def first_row(connection: Connection, kind: type[Row], *where: ColumnElement[bool]) -> Row | None:
+    """The first row of a table to which the conditions apply; None if there is none."""
+    return next(iter(rows_of(connection, kind, *where, limit=1)), None)
 
 
 class _SharedSync:
@@ -438,13 +275,13 @@ def _errors() -> Iterator[None]:
 _CHANNEL = "engram_work"
 
 
-def ring(connection: Connection) -> None:
+def notify(connection: Connection) -> None:
     """Announces work, once the transaction that is open commits."""
     if connection.dialect.name == "postgresql":
         connection.execute(text(f"NOTIFY {_CHANNEL}"))
 
 
-class Waker:
+class WorkListener:
     """Waits for work. A context manager.
 
     Args:
@@ -456,13 +293,13 @@ class Waker:
         url = None if database is None else make_url(database)
         self._url = url if url is not None and url.get_backend_name() == "postgresql" else None
         self._sleep = sleep
-        self._line: Any = None  # psycopg's connection
+        self._connection: Any = None  # psycopg's connection
 
-    def __enter__(self) -> Waker:
+    def __enter__(self) -> WorkListener:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._hang_up()
+        self._disconnect()
 
     def wait(self, seconds: float) -> None:
         """Returns after some seconds, or as soon as there is work; a broken line is a sleep."""
@@ -474,27 +311,27 @@ class Waker:
         try:
             self._listen(seconds)
         except psycopg.Error:  # the database is away: the poll finds out, and tells
-            self._hang_up()
+            self._disconnect()
             self._sleep(seconds)
 
     def _listen(self, seconds: float) -> None:
         import psycopg
 
-        if self._line is None:
+        if self._connection is None:
             assert self._url is not None
             address = self._url.set(drivername="postgresql")
-            self._line = psycopg.connect(
+            self._connection = psycopg.connect(
                 address.render_as_string(hide_password=False), autocommit=True
             )
-            self._line.execute(f"LISTEN {_CHANNEL}")
+            self._connection.execute(f"LISTEN {_CHANNEL}")
             return  # what was announced before is found by looking
-        for _ in self._line.notifies(timeout=seconds, stop_after=1):
+        for _ in self._connection.notifies(timeout=seconds, stop_after=1):
             pass
 
-    def _hang_up(self) -> None:
-        line, self._line = self._line, None
-        if line is not None:
-            line.close()
+    def _disconnect(self) -> None:
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            connection.close()
 
 
 _log = logging.getLogger(__name__)
@@ -513,55 +350,51 @@ def note(
         name: of the map; "" for none.
         **detail: plain data.
     """
-    newest = select(audit.c.number, audit.c.hash).order_by(audit.c.number.desc()).limit(1)
-    last, before = connection.execute(newest).first() or (0, "")
-    row = {
-        "number": last + 1,
-        "at_ns": at_ns,
-        "subject": subject,
-        "action": action,
-        "map": name,
-        "detail": json.dumps(detail, sort_keys=True),
-    }
-    connection.execute(insert(audit).values(**row, hash=_hash(before, row)))
+    last = next(iter(rows_of(connection, Event, order=audit.c.number.desc(), limit=1)), None)
+    number, before = (0, "") if last is None else (last.number, last.hash)
+    text_of = json.dumps(detail, sort_keys=True)
+    row = Event(number + 1, at_ns, subject, action, name, text_of, "")
+    row = replace(row, hash=_hash(before, row))
+    connection.execute(insert(audit).values(**values_of(row)))
     if _log.isEnabledFor(logging.INFO):
         known = connection.execute(select(subjects.c.name).where(subjects.c.id == subject)).scalar()
-        told = "".join(f" {key}={value}" for key, value in detail.items())
-        _log.info("%s: %s by %s%s", name or "centre", action, known or subject, told)
+        more = "".join(f" {key}={value}" for key, value in detail.items())
+        _log.info("%s: %s by %s%s", name or "centre", action, known or subject, more)
 
 
 def events_after(
-    connection: Connection, number: int, name: str | None, limit: int
+    connection: Connection, number: int, name: str, limit: int
 ) -> list[dict[str, Any]]:
-    """The next rows after a number, of one map or of all."""
-    query = select(audit).where(audit.c.number > number).order_by(audit.c.number).limit(limit)
-    if name is not None:
-        query = query.where(audit.c.map == name)
-    return _events(connection, query)
+    """The next events of a map after a number, as the API shows them."""
+    later = (audit.c.number > number, audit.c.map == name)
+    rows = rows_of(connection, Event, *later, order=audit.c.number, limit=limit)
+    return list(map(_shown, rows))
 
 
 def newest_events(connection: Connection, name: str, limit: int) -> list[dict[str, Any]]:
-    """The last rows of one map, newest first."""
-    query = select(audit).where(audit.c.map == name).order_by(audit.c.number.desc()).limit(limit)
-    return _events(connection, query)
+    """The last events of a map, newest first."""
+    newest = audit.c.number.desc()
+    rows = rows_of(connection, Event, audit.c.map == name, order=newest, limit=limit)
+    return list(map(_shown, rows))
 
 
-def _events(connection: Connection, query: Select[Any]) -> list[dict[str, Any]]:
-    rows = rows_of(connection, query)
-    return [{**row, "detail": json.loads(row["detail"])} for row in rows]
+def _shown(row: Event) -> dict[str, Any]:
+    return {**values_of(row), "detail": json.loads(row.detail)}
 
 
 def first_broken(connection: Connection) -> int | None:
     """Number of the first row that was changed, removed or added later; None for a whole log."""
     before = ""
     query = select(audit).order_by(audit.c.number).execution_options(yield_per=1000)
-    for number, row in enumerate(map(dict, connection.execute(query).mappings()), 1):
-        told = row.pop("hash")
-        if row["number"] != number or told != _hash(before, row):
+    for number, row in enumerate((Event(*one) for one in connection.execute(query)), 1):
+        if row.number != number or row.hash != _hash(before, row):
             return number
-        before = told
+        before = row.hash
     return None
 
 
-def _hash(before: str, row: dict[str, Any]) -> str:
-    return hashlib.sha256((before + json.dumps(row, sort_keys=True)).encode()).hexdigest()
+def _hash(before: str, row: Event) -> str:
+    """Hash of a row, bound to the one before; without its own."""
+    values = values_of(row)
+    del values["hash"]
+    return hashlib.sha256((before + json.dumps(values, sort_keys=True)).encode()).hexdigest()

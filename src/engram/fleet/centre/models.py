@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from engram.fleet.centre import fleet, tables
 
 Hex64 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 _HASH = "9f86d081884c7d659a2feaa0c55ad015a3bf4f1b2b0b822cd15d6c15b0f00a08"
@@ -72,16 +74,6 @@ class RefMove(Body):
     revision: Annotated[int, Field(ge=1, le=2**53, examples=[7])]
 
 
-class Ref(BaseModel):
-    """A ref. The version is its ETag."""
-
-    name: Annotated[str, Field(examples=["stable"])]
-    revision: Annotated[int, Field(examples=[7])]
-    version: Annotated[int, Field(examples=[3])]
-    moved_ns: int
-    moved_by: str
-
-
 class RevertRequest(Body):
     """A revision whose additions are to be hidden."""
 
@@ -97,18 +89,6 @@ class DownloadRequest(Body):
     options: Annotated[
         dict[str, Any], Field(examples=[{"select": "tod+paths", "depart_h": 9.5, "arrive_h": 11.0}])
     ] = {}
-
-
-class Artifact(BaseModel):
-    """A download; `report` has the forecast once it is ready."""
-
-    id: Annotated[str, Field(examples=[_ID])]
-    map: Annotated[str, Field(examples=["fleet"])]
-    revision: Annotated[int, Field(examples=[7])]
-    state: Annotated[str, Field(examples=["ready"])]
-    manifest: str | None
-    report: dict[str, Any] | None
-    error: str | None
 
 
 class Parts(Body):
@@ -136,45 +116,6 @@ class ManifestBody(Body):
     base: Hex64 | None = None
 
 
-class HandIn(BaseModel):
-    """A hand-in: also the job that merges it."""
-
-    id: Annotated[str, Field(examples=[_ID])]
-    map: Annotated[str, Field(examples=["fleet"])]
-    robot: Annotated[str, Field(examples=[_ID])]
-    state: Annotated[str, Field(examples=["merged"])]
-    manifest: str
-    content_hash: str
-    bytes: int
-    revision: int | None
-    progress: str
-    report: dict[str, Any] | None
-    error: str | None
-    begun_ns: int
-    ended_ns: int | None
-    wanted: Annotated[
-        list[str],
-        Field(description="the next parts to send, while the hand-in is open", examples=[[_HASH]]),
-    ] = []
-
-
-class Dream(BaseModel):
-    """A job that looks for a better map in what was handed in; `report` once it is done."""
-
-    id: Annotated[str, Field(examples=[_ID])]
-    map: Annotated[str, Field(examples=["fleet"])]
-    state: Annotated[str, Field(examples=["done"])]
-    asked_by: str
-    asked_ns: int
-    ended_ns: int | None
-    revision: Annotated[
-        int | None, Field(description="revision that the dream made, if it found a better map")
-    ]
-    progress: str
-    report: dict[str, Any] | None
-    error: str | None
-
-
 class RobotReport(Body):
     """What a robot runs, and with which result."""
 
@@ -184,17 +125,6 @@ class RobotReport(Body):
     driven_m: Annotated[float | None, Field(ge=0, le=1e9, examples=[1840.0])] = None
     outbox: Annotated[int, Field(ge=0, le=10**6, examples=[0])] = 0
     told: Annotated[str, Field(max_length=500)] = ""
-
-
-class Wanted(BaseModel):
-    """Which version a robot is to run, and which of its hand-ins it may drop."""
-
-    follows: Annotated[str, Field(examples=["stable"])]
-    revision: Annotated[int, Field(examples=[7])]
-    version: Annotated[
-        str, Field(description="version of the revision, never reused", examples=["7-18a3f0c2"])
-    ]
-    durable_revision: Annotated[int, Field(examples=[5])]
 
 
 class Following(Body):
@@ -227,13 +157,6 @@ class Me(BaseModel):
     id: Annotated[str, Field(examples=[_ID])]
     name: Annotated[str, Field(examples=["alice"])]
     roles: Annotated[dict[str, str], Field(examples=[{"fleet": "operator"}])]
-
-
-class MapListed(BaseModel):
-    """A map that the caller may read."""
-
-    name: Annotated[str, Field(examples=["fleet"])]
-    durable_revision: Annotated[int, Field(examples=[5])]
 
 
 class MapCounts(Open):
@@ -273,19 +196,6 @@ class Reverted(BaseModel):
     lost_by_others: Annotated[dict[str, int], Field(examples=[{"edges": 2}])]
 
 
-class RobotListed(BaseModel):
-    """A robot, what it follows, and its last report."""
-
-    robot: Annotated[str, Field(examples=[_ID])]
-    map: Annotated[str, Field(examples=["fleet"])]
-    name: Annotated[str, Field(examples=["r1"])]
-    follows: Annotated[str, Field(examples=["stable"])]
-    report: Annotated[dict[str, Any], Field(examples=[{"runs": "7-18a3f0c2", "outbox": 0}])]
-    reported_ns: Annotated[int | None, Field(examples=[1_795_589_202_183_444_985])]
-    disabled: Annotated[int, Field(examples=[0])]
-    handins: Annotated[int | None, Field(examples=[3])]
-
-
 class Job(Open):
     """A hand-in, a download or a dream that waits or runs."""
 
@@ -308,3 +218,67 @@ class Problem(Open):
     title: Annotated[str, Field(examples=["Changed meanwhile"])]
     status: Annotated[int, Field(examples=[412])]
     detail: Annotated[str, Field(examples=["stable is at version 4, not 3: read it again"])]
+
+
+def _answer(row: type, hidden: tuple[str, ...] = (), **shown: Any) -> type[BaseModel]:
+    """A model of the columns of a row that the API shows, each with an example or more."""
+    columns: dict[str, Any] = {}
+    for name, kind in get_type_hints(row).items():
+        if name not in hidden:
+            example = shown.get(name, Field())
+            is_field = isinstance(example, type(Field()))
+            columns[name] = (kind, example if is_field else Field(examples=[example]))
+    columns |= {name: more for name, more in shown.items() if name not in columns}
+    return create_model(row.__name__, __doc__=row.__doc__, **columns)
+
+
+MapListed = _answer(tables.MapListed, ("created_ns", "options"), name="fleet", durable_revision=5)
+Ref = _answer(tables.Ref, ("map",), name="stable", revision=7, version=3)
+Artifact = _answer(
+    tables.Artifact,
+    ("options", "asked_ns", "used_ns"),
+    id=_ID,
+    map="fleet",
+    revision=7,
+    state="ready",
+)
+HandIn = _answer(
+    tables.HandIn,
+    ("base", "place", "tries", "cancelled", "ungated"),
+    id=_ID,
+    map="fleet",
+    robot=_ID,
+    state="merged",
+    wanted=(
+        list[str],
+        Field(
+            [], description="the next parts to send, while the hand-in is open", examples=[[_HASH]]
+        ),
+    ),
+)
+Dream = _answer(
+    tables.Dream,
+    ("since",),
+    id=_ID,
+    map="fleet",
+    state="done",
+    revision=Field(description="revision that the dream made, if it found a better map"),
+)
+RobotListed = _answer(
+    fleet.RobotListed,
+    robot=_ID,
+    map="fleet",
+    name="r1",
+    follows="stable",
+    report={"runs": "7-18a3f0c2", "outbox": 0},
+    reported_ns=1_795_589_202_183_444_985,
+    disabled=0,
+    handins=3,
+)
+Wanted = _answer(
+    fleet.Wanted,
+    follows="stable",
+    revision=7,
+    version=Field(description="version of the revision, never reused", examples=["7-18a3f0c2"]),
+    durable_revision=5,
+)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from http import HTTPStatus
 from typing import Annotated, Any
 
@@ -22,21 +21,16 @@ from engram.errors import (
     StorageFullError,
 )
 from engram.fleet.centre.access import Role, Subject, subject_of
-from engram.fleet.centre.errors import CentreError, NotKnownError, StoreError
-from engram.fleet.centre.models import Problem
+from engram.fleet.centre.models import Page, Problem
+from engram.fleet.centre.problems import CentreError, NotKnownError, StoreError
 from engram.fleet.centre.service import Centre
 
 COOKIE = "engram_token"
 
 
-async def centre_of(request: Request) -> Centre:
+async def centre_of(request: Request) -> Any:
     """The centre of the application."""
-    return _centre(request)
-
-
-def _centre(request: Request) -> Centre:
-    found: Centre = request.app.state.centre
-    return found
+    return request.app.state.centre
 
 
 def who_asks(request: Request) -> Subject:
@@ -50,7 +44,7 @@ def who_asks(request: Request) -> Subject:
         token = request.cookies.get(COOKIE, "") if _reads_only(request) else ""
     if not token:
         raise NotKnownError("send Authorization: Bearer TOKEN")
-    return subject_of(_centre(request), token)
+    return subject_of(request.app.state.centre, token)
 
 
 def _reads_only(request: Request) -> bool:
@@ -72,13 +66,10 @@ def takes(*roles: Role) -> Any:
     return Depends(check)
 
 
-def page_of(
-    items: list[dict[str, Any]], limit: int, cursor: Callable[[dict[str, Any]], object]
-) -> dict[str, Any]:
+def page_of(items: list[dict[str, Any]], limit: int, cursor: str) -> Page:
     """A page of a list that was read with one item more than its limit."""
-    more = len(items) > limit
     shown = items[:limit]
-    return {"items": shown, "next": str(cursor(shown[-1])) if more and shown else None}
+    return Page(items=shown, next=str(shown[-1][cursor]) if len(items) > limit else None)
 
 
 MEDIA = "application/problem+json"
@@ -113,7 +104,7 @@ def add_problems(app: FastAPI) -> None:
 
     @app.exception_handler(EngramError)
     def foreseen(request: Request, error: EngramError) -> Response:
-        told = request.app.state.centre.words_of(error)
+        words = request.app.state.centre.words_of(error)
         if isinstance(error, CentreError):
             status, title = error.status, error.title
         else:
@@ -123,8 +114,8 @@ def add_problems(app: FastAPI) -> None:
             if request.headers.get("accept", "").startswith("text/html"):  # somebody at a browser
                 return RedirectResponse("/", 303)
         else:
-            _log.info("%s %s: %d %s", request.method, request.url.path, status, told)
-        return problem(status, title, told)
+            _log.info("%s %s: %d %s", request.method, request.url.path, status, words)
+        return problem(status, title, words)
 
     @app.exception_handler(HTTPException)
     def refused(_: Request, error: HTTPException) -> JSONResponse:
@@ -137,8 +128,8 @@ def add_problems(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     def malformed(_: Request, error: RequestValidationError) -> JSONResponse:
         faults = [
-            {"where": ".".join(map(str, one["loc"])), "what": str(one["msg"])}
-            for one in error.errors()
+            {"where": ".".join(map(str, fault["loc"])), "what": str(fault["msg"])}
+            for fault in error.errors()
         ]
-        detail = "; ".join(f"{one['where']}: {one['what']}" for one in faults)
+        detail = "; ".join(f"{fault['where']}: {fault['what']}" for fault in faults)
         return problem(422, "The request is malformed", detail, faults=faults)

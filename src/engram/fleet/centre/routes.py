@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator
+from operator import itemgetter
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Path, Query, Request, Response
@@ -13,13 +14,15 @@ from fastapi.responses import StreamingResponse
 
 from engram.config import plain
 from engram.errors import InputError
-from engram.fleet.centre import models
+from engram.fleet.centre import fleet, models
 from engram.fleet.centre.access import Role, disable, enrol, new_code, new_nonce, new_token
 from engram.fleet.centre.database import events_after, note
-from engram.fleet.centre.errors import ChangedError
-from engram.fleet.centre.fleet import Fleet, Refs
+from engram.fleet.centre.fleet import RobotListed, Wanted
+from engram.fleet.centre.problems import ChangedError
 from engram.fleet.centre.requests import Asking, CentreHere, page_of, takes
 from engram.fleet.centre.service import Centre
+from engram.fleet.centre.tables import MapListed, Ref
+from engram.fleet.centre.tables import maps as map_table
 from engram.maps.history import blame_node, map_log
 from engram.maps.map import Map
 
@@ -32,14 +35,11 @@ Node = Annotated[str, Path(max_length=36, pattern=r"^[0-9a-fA-F-]+$")]
 _EVENTS_AT_ONCE = 100
 
 
-@maps_router.get("/maps", response_model=list[models.MapListed])
-def maps(centre: CentreHere, who: Asking) -> list[dict[str, Any]]:
+@maps_router.get("/maps", response_model=list[models.MapListed])  # type: ignore[valid-type]
+def maps(centre: CentreHere, who: Asking) -> list[MapListed]:
     """The maps of the one who asks."""
-    return [
-        {"name": row["name"], "durable_revision": row["durable_revision"]}
-        for row in centre.map_rows()
-        if who.role_on(row["name"]) is not None
-    ]
+    rows = centre.database.rows(MapListed, order=map_table.c.name)
+    return [row for row in rows if who.role_on(row.name) is not None]
 
 
 @maps_router.get("/maps/{name}", response_model=models.MapCounts, dependencies=READERS)
@@ -50,12 +50,14 @@ def one_map(name: str, centre: CentreHere) -> dict[str, Any]:
         return {"name": name, **plain(counts), "content_hash": content_hash}
 
 
-@maps_router.get("/maps/{name}/revisions", response_model=models.Page, dependencies=READERS)
-def revisions(name: str, centre: CentreHere, cursor: Cursor = None, limit: Limit = 100) -> Any:
+@maps_router.get("/maps/{name}/revisions", dependencies=READERS)
+def revisions(
+    name: str, centre: CentreHere, cursor: Cursor = None, limit: Limit = 100
+) -> models.Page:
     """The revisions, newest first."""
-    log = sorted(map_log(centre.map_path(name)), key=lambda one: -int(one["number"]))
-    rest = [one for one in log if cursor is None or one["number"] < cursor]
-    return page_of(rest[: limit + 1], limit, lambda one: one["number"])
+    log = sorted(map_log(centre.map_path(name)), key=itemgetter("number"), reverse=True)
+    rest = [entry for entry in log if cursor is None or entry["number"] < cursor]
+    return page_of(rest[: limit + 1], limit, "number")
 
 
 @maps_router.get("/maps/{name}/diff", response_model=models.Difference, dependencies=PEOPLE)
@@ -76,17 +78,17 @@ def blame(name: str, node: Node, centre: CentreHere) -> dict[str, Any]:
     return blame_node(centre.map_path(name), node)
 
 
-@maps_router.get("/maps/{name}/refs", response_model=list[models.Ref], dependencies=READERS)
-def refs(name: str, centre: CentreHere) -> list[dict[str, Any]]:
+@maps_router.get("/maps/{name}/refs", response_model=list[models.Ref], dependencies=READERS)  # type: ignore[valid-type]
+def refs(name: str, centre: CentreHere) -> list[Ref]:
     """The refs; `head` is the newest revision."""
-    return Refs(centre).all(name)
+    return fleet.refs_of(centre, name)
 
 
 @maps_router.get("/maps/{name}/refs/{ref}", response_model=models.Ref, dependencies=READERS)
-def one_ref(name: str, ref: str, response: Response, centre: CentreHere) -> dict[str, Any]:
+def one_ref(name: str, ref: str, response: Response, centre: CentreHere) -> Ref:
     """One ref, with its version as ETag."""
-    row = Refs(centre).get(name, ref)
-    response.headers["ETag"] = _etag(row["version"])
+    row = fleet.ref_of(centre, name, ref)
+    response.headers["ETag"] = f'"{row.version}"'
     return row
 
 
@@ -101,29 +103,27 @@ def move_ref(
     centre: CentreHere,
     who: Asking,
     if_match: Annotated[str | None, Header(examples=['"3"'])] = None,
-) -> dict[str, Any]:
+) -> Ref:
     """Moves a ref that still has the version of `If-Match`; `"0"` makes a new one."""
-    version = Refs(centre).move(name, ref, body.revision, who.id, _version(if_match))
-    response.headers["ETag"] = _etag(version)
-    return Refs(centre).get(name, ref)
+    version = fleet.move_ref(centre, name, ref, body.revision, who.id, _version(if_match))
+    response.headers["ETag"] = f'"{version}"'
+    return fleet.ref_of(centre, name, ref)
 
 
 @maps_router.delete("/maps/{name}/refs/{ref}", status_code=204, dependencies=[takes(Role.OPERATOR)])
 def remove_ref(name: str, ref: str, centre: CentreHere, who: Asking) -> None:
     """Removes a ref."""
-    Refs(centre).remove(name, ref, who.id)
+    fleet.remove_ref(centre, name, ref, who.id)
 
 
-@maps_router.post(
-    "/maps/{name}/reverts", response_model=models.Reverted, dependencies=[takes(Role.OPERATOR)]
-)
+@maps_router.post("/maps/{name}/reverts", dependencies=[takes(Role.OPERATOR)])
 def revert(
     name: str,
     body: models.RevertRequest,
     centre: CentreHere,
     who: Asking,
     if_match: Annotated[str | None, Header(examples=['"9"'])] = None,
-) -> dict[str, Any]:
+) -> models.Reverted:
     """Hides what a revision added, if `head` still has the version of `If-Match`.
 
     Sent again after its answer was lost, it fails with 412 instead of reverting twice.
@@ -137,16 +137,13 @@ def revert(
         done = store.revert(
             body.revision, author=who.name, message=body.message, dry_run=body.dry_run
         )
-    if done.revision is not None:
-        with centre.database.writing() as connection:
-            detail = {"reverted": body.revision, "revision": done.revision.number}
-            note(connection, centre.now_ns(), who.id, "revert", name, **detail)
     number = None if done.revision is None else done.revision.number
-    return {
-        "revision": number,
-        "dry_run": body.dry_run,
-        "lost_by_others": dict(done.lost_by_others),
-    }
+    if number is not None:
+        with centre.database.writing() as connection:
+            detail = {"reverted": body.revision, "revision": number}
+            note(connection, centre.now_ns(), who.id, "revert", name, **detail)
+    lost = dict(done.lost_by_others)
+    return models.Reverted(revision=number, dry_run=body.dry_run, lost_by_others=lost)
 
 
 @maps_router.get("/maps/{name}/events", dependencies=PEOPLE)
@@ -171,27 +168,23 @@ async def _events(
 
     yield ": events\n\n"
     while True:
-        some = await run_in_threadpool(read)
-        for one in some:
-            after = one["number"]
-            yield f"id: {after}\nevent: {one['action']}\ndata: {json.dumps(one)}\n\n"
-        if some:
+        batch = await run_in_threadpool(read)
+        for event in batch:
+            after = event["number"]
+            yield f"id: {after}\nevent: {event['action']}\ndata: {json.dumps(event)}\n\n"
+        if batch:
             continue
         if not follow or await request.is_disconnected():
             return
         await asyncio.sleep(centre.settings.poll_s)
 
 
-@maps_router.get("/maps/{name}/audit", response_model=models.Page, dependencies=[takes(Role.ADMIN)])
-def audit(name: str, centre: CentreHere, cursor: Cursor = None, limit: Limit = 100) -> Any:
+@maps_router.get("/maps/{name}/audit", dependencies=[takes(Role.ADMIN)])
+def audit(name: str, centre: CentreHere, cursor: Cursor = None, limit: Limit = 100) -> models.Page:
     """Every change of state, oldest first."""
     with centre.database.reading() as connection:
         rows = events_after(connection, cursor or 0, name, limit + 1)
-    return page_of(rows, limit, lambda one: one["number"])
-
-
-def _etag(version: int) -> str:
-    return f'"{version}"'
+    return page_of(rows, limit, "number")
 
 
 def _version(if_match: str | None) -> int | None:
@@ -206,57 +199,57 @@ def _version(if_match: str | None) -> int | None:
 robots_router = APIRouter(tags=["robots"])
 
 
-@robots_router.post("/robots/enrol", response_model=models.Enrolled)
-def enrol_robot(body: models.Enrolment, centre: CentreHere) -> dict[str, Any]:
+@robots_router.post("/robots/enrol")
+def enrol_robot(body: models.Enrolment, centre: CentreHere) -> models.Enrolled:
     """Enrols a robot with a one-time code. Again with the same code and key it is the same."""
     key, signature = bytes.fromhex(body.public_key), bytes.fromhex(body.signature)
     robot = enrol(centre, body.code, body.name, key, signature)
-    return {"robot": robot.id, "maps": sorted(robot.roles)}
+    return models.Enrolled(robot=robot.id, maps=sorted(robot.roles))
 
 
-@robots_router.post("/token/nonce", response_model=models.Nonce)
-def ask_nonce(body: models.NonceRequest, centre: CentreHere) -> dict[str, Any]:
+@robots_router.post("/token/nonce")
+def ask_nonce(body: models.NonceRequest, centre: CentreHere) -> models.Nonce:
     """What to sign to get a token."""
-    return {"nonce": new_nonce(centre, body.robot)}
+    return models.Nonce(nonce=new_nonce(centre, body.robot))
 
 
-@robots_router.post("/token", response_model=models.Token)
-def ask_token(body: models.TokenRequest, centre: CentreHere) -> dict[str, Any]:
+@robots_router.post("/token")
+def ask_token(body: models.TokenRequest, centre: CentreHere) -> models.Token:
     """A token for a signed nonce."""
     token = new_token(centre, body.robot, body.nonce, bytes.fromhex(body.signature))
-    return {"token": token, "expires_in_s": centre.settings.token_s}
+    return models.Token(token=token, expires_in_s=centre.settings.token_s)
 
 
-@robots_router.get("/me", response_model=models.Me)
-def who_am_i(who: Asking) -> dict[str, Any]:
+@robots_router.get("/me")
+def who_am_i(who: Asking) -> models.Me:
     """The holder of the token."""
-    return {"id": who.id, "name": who.name, "roles": dict(who.roles)}
+    return models.Me(id=who.id, name=who.name, roles=dict(who.roles))
 
 
 @robots_router.put(
     "/maps/{name}/robots/me/report", response_model=models.Wanted, dependencies=[takes(Role.ROBOT)]
 )
-def report(name: str, body: models.RobotReport, centre: CentreHere, who: Asking) -> dict[str, Any]:
+def report(name: str, body: models.RobotReport, centre: CentreHere, who: Asking) -> Wanted:
     """Reports what the robot runs; answers what it is to run."""
-    return Fleet(centre).report(name, who.id, body.model_dump())
+    return fleet.note_report(centre, name, who.id, body.model_dump())
 
 
 @robots_router.get(
     "/maps/{name}/robots/me", response_model=models.Wanted, dependencies=[takes(Role.ROBOT)]
 )
-def wanted(name: str, centre: CentreHere, who: Asking) -> dict[str, Any]:
+def wanted(name: str, centre: CentreHere, who: Asking) -> Wanted:
     """What the robot is to run."""
-    return Fleet(centre).wanted(name, who.id)
+    return fleet.wanted_by(centre, name, who.id)
 
 
 @robots_router.get(
     "/maps/{name}/robots",
-    response_model=list[models.RobotListed],
+    response_model=list[models.RobotListed],  # type: ignore[valid-type]
     dependencies=[takes(Role.VIEWER)],
 )
-def robots(name: str, centre: CentreHere) -> list[dict[str, Any]]:
+def robots(name: str, centre: CentreHere) -> list[RobotListed]:
     """The robots of a map and their last reports."""
-    return Fleet(centre).all(name)
+    return fleet.robots_of(centre, name)
 
 
 @robots_router.put(
@@ -266,7 +259,7 @@ def robots(name: str, centre: CentreHere) -> list[dict[str, Any]]:
 )
 def follow(name: str, robot: str, body: models.Following, centre: CentreHere, who: Asking) -> None:
     """Lets a robot follow a ref, or pins it to a revision."""
-    Fleet(centre).follow(name, robot, body.follows, who.id)
+    fleet.follow(centre, name, robot, body.follows, who.id)
 
 
 @robots_router.delete(
@@ -274,15 +267,11 @@ def follow(name: str, robot: str, body: models.Following, centre: CentreHere, wh
 )
 def take_away(name: str, robot: str, centre: CentreHere, who: Asking) -> None:
     """Revokes a robot's tokens permanently."""
-    Fleet(centre).wanted(name, robot)
+    fleet.wanted_by(centre, name, robot)
     disable(centre, robot, who.id)
 
 
-@robots_router.post(
-    "/maps/{name}/codes", response_model=models.Code, dependencies=[takes(Role.ADMIN)]
-)
-def make_code(
-    name: str, body: models.CodeRequest, centre: CentreHere, who: Asking
-) -> dict[str, Any]:
+@robots_router.post("/maps/{name}/codes", dependencies=[takes(Role.ADMIN)])
+def make_code(name: str, body: models.CodeRequest, centre: CentreHere, who: Asking) -> models.Code:
     """A code with which one robot enrols."""
-    return {"code": new_code(centre, name, body.follows, who.id)}
+    return models.Code(code=new_code(centre, name, body.follows, who.id))

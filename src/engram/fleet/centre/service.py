@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
-from enum import StrEnum
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,18 +18,10 @@ from sqlalchemy import URL, Connection, Select, func, select, update
 from engram.config import check_bounds, from_dict, to_dict
 from engram.errors import InputError, MapLockedError
 from engram.files import WriterLock
-from engram.fleet.centre.database import (
-    ServiceDatabase,
-    artifacts,
-    first_row,
-    handins,
-    maps,
-    note,
-    refs,
-    rows_of,
-)
-from engram.fleet.centre.errors import UnknownError
+from engram.fleet.centre.database import ServiceDatabase, note
 from engram.fleet.centre.objects import BucketObjects, FolderObjects, Objects, Packs
+from engram.fleet.centre.problems import UnknownError
+from engram.fleet.centre.tables import JobState, MapListed, artifacts, handins, maps, refs
 from engram.fleet.merge.settings import MergeOptions
 from engram.maps.map import Map
 from engram.maps.map_reader import MapReader
@@ -46,7 +36,7 @@ class _Held:
     retired: bool = False
 
 
-class ResidentMaps:
+class OpenMaps:
     """Open maps, for reading, shared by threads.
 
     What is read of a map once (its log, its nodes) stays until it has a new revision.
@@ -154,24 +144,7 @@ class CentreSettings:
         check_bounds(self)
 
 
-class HandInState(StrEnum):
-    """Where a hand-in is."""
-
-    OPEN = "open"  # parts are missing
-    COMPLETE = "complete"  # waits for a worker, or is in its hands
-    MERGED = "merged"
-    REFUSED = "refused"  # by the gate; a person may merge it all the same
-    FAILED = "failed"  # it is no map that can be merged here
-    CANCELLED = "cancelled"
-
-
-ENDED = frozenset(
-    {HandInState.MERGED, HandInState.REFUSED, HandInState.FAILED, HandInState.CANCELLED}
-)
-# Of downloads, and of dreams.
-READY, ASKED, FAILED = "ready", "asked", "failed"
-DONE, CANCELLED = "done", "cancelled"
-_UNDER_WAY = (HandInState.OPEN, HandInState.COMPLETE, HandInState.REFUSED)
+_UNDER_WAY = (JobState.OPEN, JobState.COMPLETE, JobState.REFUSED)
 
 
 def manifest_key(name: str, manifest: str) -> str:
@@ -187,13 +160,14 @@ def needed_manifests(connection: Connection, name: str, limit_ns: int) -> list[s
     """
     of_map = handins.c.map == name
     newest = newest_merged(name)
-    late = handins.c.state.in_(map(str, _UNDER_WAY)) | (handins.c.ended_ns >= limit_ns)
+    late = handins.c.state.in_(_UNDER_WAY) | (handins.c.ended_ns >= limit_ns)
+    ready = (artifacts.c.map == name) & (artifacts.c.state == JobState.READY)
     found: list[str] = []
     for query in (
         select(handins.c.manifest).where(of_map, late),
         select(handins.c.base).where(of_map, late, handins.c.base.is_not(None)),
         select(handins.c.manifest).where(of_map, handins.c.place.in_(newest)),
-        select(artifacts.c.manifest).where(artifacts.c.map == name, artifacts.c.state == READY),
+        select(artifacts.c.manifest).where(ready),
     ):
         found += connection.execute(query).scalars()
     return list(dict.fromkeys(found))
@@ -201,7 +175,7 @@ def needed_manifests(connection: Connection, name: str, limit_ns: int) -> list[s
 
 def newest_merged(name: str) -> Select[Any]:
     """Places of each robot's newest merged hand-in to a map."""
-    merged = (handins.c.map == name) & (handins.c.state == str(HandInState.MERGED))
+    merged = (handins.c.map == name) & (handins.c.state == JobState.MERGED)
     return select(func.max(handins.c.place)).where(merged).group_by(handins.c.robot)
 
 
@@ -272,7 +246,7 @@ class Centre:
             FolderObjects(self.folder / "objects") if objects is None else BucketObjects(objects)
         )
         self._packs: dict[str, Packs] = {}
-        self._resident = ResidentMaps()
+        self._open_maps = OpenMaps()
 
     def __enter__(self) -> Centre:
         return self
@@ -282,7 +256,7 @@ class Centre:
 
     def close(self) -> None:
         """Closes the database and the maps."""
-        self._resident.close()
+        self._open_maps.close()
         self.database.close()
 
     def words_of(self, error: Exception) -> str:
@@ -318,14 +292,9 @@ class Centre:
                     "backup, and robots upload the rest again"
                 )
             Map.create(path).close()
-        row = {
-            "name": name,
-            "created_ns": self.now_ns(),
-            "durable_revision": 0,
-            "options": json.dumps(to_dict(policy or MapPolicy())),
-        }
+        row = MapListed(name, self.now_ns(), 0, to_dict(policy or MapPolicy()))
         with self.database.writing() as connection:
-            if self.database.add(connection, maps, [row]):
+            if self.database.add(connection, row):
                 note(connection, self.now_ns(), by, "map", name)
             self._follow_file(connection, name, by)
 
@@ -338,7 +307,7 @@ class Centre:
             head, now = store.revision, self.now_ns()
         late = (handins.c.map == name) & (handins.c.revision > head)
         lost: dict[str, Any] = dict.fromkeys(("base", "place", "ended_ns", "revision", "report"))
-        lost |= {"state": str(HandInState.OPEN), "begun_ns": now, "tries": 0}
+        lost |= {"state": JobState.OPEN, "begun_ns": now, "tries": 0}
         again = update(handins).where(late).values(**lost)
         ahead = (refs.c.map == name) & (refs.c.revision > head)
         back = update(refs).where(ahead).values(revision=head, version=refs.c.version + 1)
@@ -350,8 +319,7 @@ class Centre:
 
     def map_names(self) -> list[str]:
         """All maps."""
-        with self.database.reading() as connection:
-            return list(connection.execute(select(maps.c.name).order_by(maps.c.name)).scalars())
+        return [row.name for row in self.database.rows(MapListed, order=maps.c.name)]
 
     @contextmanager
     def lane(self, name: str) -> Iterator[bool]:
@@ -366,24 +334,16 @@ class Centre:
         finally:
             lock.release()
 
-    def map_row(self, name: str) -> dict[str, Any]:
+    def map_row(self, name: str) -> MapListed:
         """The row of a map.
 
         Raises:
             UnknownError: there is none.
         """
-        row = None
-        if _NAME.fullmatch(name):
-            with self.database.reading() as connection:
-                row = first_row(connection, select(maps).where(maps.c.name == name))
+        row = self.database.row(MapListed, maps.c.name == name) if _NAME.fullmatch(name) else None
         if row is None:
             raise UnknownError(f"there is no map {name!r:.60}")
         return row
-
-    def map_rows(self) -> list[dict[str, Any]]:
-        """The rows of all maps."""
-        with self.database.reading() as connection:
-            return rows_of(connection, select(maps).order_by(maps.c.name))
 
     def map_path(self, name: str) -> Path:
         """The file of a map.
@@ -400,17 +360,17 @@ class Centre:
         Raises:
             UnknownError: there is none.
         """
-        return self._resident.reading(self.map_path(name))
+        return self._open_maps.reading(self.map_path(name))
 
     def policy(self, name: str) -> MapPolicy:
         """How a map takes hand-ins."""
-        return from_dict(json.loads(self.map_row(name)["options"]), MapPolicy)
+        return from_dict(self.map_row(name).options, MapPolicy)
 
     def set_policy(self, name: str, policy: MapPolicy, by: str) -> None:
         """Changes how a map takes hand-ins."""
-        row = {**self.map_row(name), "options": json.dumps(to_dict(policy))}
+        row = replace(self.map_row(name), options=to_dict(policy))
         with self.database.writing() as connection:
-            self.database.put(connection, maps, row)
+            self.database.put(connection, row)
             note(connection, self.now_ns(), by, "policy", name, policy=to_dict(policy))
 
     def set_durable(self, name: str, revision: int, by: str) -> None:
@@ -422,9 +382,9 @@ class Centre:
         with self.reading(name) as store:
             if not 0 <= revision <= store.revision:
                 raise InputError(f"{name} has revisions 0 to {store.revision}, not {revision}")
-        row = {**self.map_row(name), "durable_revision": revision}
+        row = replace(self.map_row(name), durable_revision=revision)
         with self.database.writing() as connection:
-            self.database.put(connection, maps, row)
+            self.database.put(connection, row)
             note(connection, self.now_ns(), by, "durable", name, revision=revision)
 
 

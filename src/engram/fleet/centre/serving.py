@@ -19,7 +19,7 @@ from typing import Any
 
 from engram.errors import ConfigError, InputError, MapError, MissingExtraError, StorageFullError
 from engram.files import draft_folder
-from engram.fleet.centre.database import Waker
+from engram.fleet.centre.database import WorkListener
 from engram.fleet.centre.objects import FolderObjects, sync_folder
 from engram.fleet.centre.service import Centre
 from engram.fleet.centre.worker import work
@@ -72,7 +72,7 @@ def serve(centre: Centre, listening: Listening, *, worker: bool = True) -> None:
     try:
         import uvicorn
 
-        from engram.fleet.centre.app import create_app
+        from engram.fleet.centre.application import create_app
     except ImportError as error:
         raise MissingExtraError(
             "the centre needs its extra: pip install 'engram-localisation[centre]'"
@@ -139,9 +139,9 @@ def run_worker(
     with (
         logging_to_stderr(),
         Centre(folder, database, objects) as centre,
-        Waker(database, stop.wait) as waker,
+        WorkListener(database, stop.wait) as listener,
     ):
-        work(centre, waker.wait, stop.is_set, scheduler)
+        work(centre, listener.wait, stop.is_set, scheduler)
 
 
 @contextmanager

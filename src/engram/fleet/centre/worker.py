@@ -22,29 +22,25 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from sqlalchemy import select
 
 from engram.errors import EngramError, MapCorruptError, MapLockedError, StorageFullError
-from engram.fleet.centre.database import artifacts, note, packs
-from engram.fleet.centre.errors import StoreError
-from engram.fleet.centre.fleet import Refs
-from engram.fleet.centre.handins import HandIns
-from engram.fleet.centre.jobs import Downloads, Dreams
-from engram.fleet.centre.merging import WaitsError, Watching, admit, merge_apart
+from engram.fleet.centre import downloads, dreams, handins, jobs
+from engram.fleet.centre.database import first_row, note
+from engram.fleet.centre.fleet import move_ref
+from engram.fleet.centre.merge_job import JobMonitor, WaitsError, admit, merge_apart
 from engram.fleet.centre.objects import written_ns
+from engram.fleet.centre.problems import StoreError
 from engram.fleet.centre.service import (
-    ASKED,
-    CANCELLED,
     DAY_NS,
-    DONE,
-    FAILED,
     Centre,
     kept_since_ns,
     manifest_key,
     needed_manifests,
 )
+from engram.fleet.centre.tables import Artifact, Dream, HandIn, JobState, artifacts, packs
 from engram.fleet.dream import DreamOptions, dream
 from engram.fleet.transfers import PartHash, blobs_named, decode_manifest
 from engram.maps.map import Map
@@ -64,8 +60,8 @@ def sweep_all(centre: Centre) -> None:
                     sweep(centre, name)
             except EngramError as error:
                 with centre.database.writing() as connection:
-                    told = str(error)
-                    note(connection, centre.now_ns(), "worker", "sweep-failed", name, error=told)
+                    why = str(error)
+                    note(connection, centre.now_ns(), "worker", "sweep-failed", name, error=why)
 
 
 def sweep(centre: Centre, name: str) -> int:
@@ -90,12 +86,12 @@ def sweep(centre: Centre, name: str) -> int:
         manifests = needed_manifests(connection, name, limit_ns)
     _mark(centre, name, manifests, marks)
     with centre.database.writing() as connection:
-        making = select(artifacts.c.id).where(artifacts.c.map == name, artifacts.c.state == ASKED)
-        if connection.execute(making).first() is not None:
+        making = (artifacts.c.map == name, artifacts.c.state == JobState.ASKED)
+        if first_row(connection, Artifact, *making) is not None:
             return 0  # its parts are found or stored now, and not yet named by a manifest
         manifests = needed_manifests(connection, name, limit_ns)
         _mark(centre, name, manifests, marks)
-        needed = set[PartHash]().union(*(marks[one] for one in manifests))
+        needed = set[PartHash]().union(*(marks[manifest] for manifest in manifests))
         gone = store.little_needed(connection, needed, limit_ns)
         size = sum(store.forget(connection, pack, kept, centre.now_ns()) for pack, kept in gone)
         if gone:
@@ -106,19 +102,19 @@ def sweep(centre: Centre, name: str) -> int:
 def _mark(centre: Centre, name: str, manifests: Iterable[str], marks: _Marks) -> None:
     """Adds the parts of manifests that are not marked yet, as far as they are there."""
     store = centre.packs(name)
-    for one in manifests:
-        if one in marks:
+    for key in manifests:
+        if key in marks:
             continue
-        manifest = decode_manifest(centre.objects.get(manifest_key(name, one)))
+        manifest = decode_manifest(centre.objects.get(manifest_key(name, key)))
         pages = dict(store.read(dict.fromkeys(manifest.hashes())))
-        marks[one] = set(pages)
-        here = {
-            table: tuple(page for page in some if page in pages)
-            for table, some in manifest.pages.items()
+        marks[key] = set(pages)
+        stored = {
+            table: tuple(page for page in listed if page in pages)
+            for table, listed in manifest.pages.items()
         }
         with suppress(MapCorruptError):  # a stranger's page: its hand-in fails by itself
-            for _, _, blobs in blobs_named(replace(manifest, pages=here), pages.get):
-                marks[one].update(blobs)
+            for _, _, blobs in blobs_named(replace(manifest, pages=stored), pages.get):
+                marks[key].update(blobs)
 
 
 def _delete_forgotten(centre: Centre, name: str) -> None:
@@ -127,9 +123,9 @@ def _delete_forgotten(centre: Centre, name: str) -> None:
     keys = [key.rsplit("/", 1)[1] for key in centre.objects.keys(f"packs/{name}")]
     with centre.database.reading() as connection:
         known = set(connection.execute(select(packs.c.id).where(packs.c.map == name)).scalars())
-    for one in keys:
-        if one not in known and written_ns(one) <= limit_ns:
-            centre.objects.delete(f"packs/{name}/{one}")
+    for pack in keys:
+        if pack not in known and written_ns(pack) <= limit_ns:
+            centre.objects.delete(f"packs/{name}/{pack}")
 
 
 _NICENESS = 10
@@ -152,54 +148,52 @@ def dream_a_while(
     Returns:
         Whether it dreamt.
     """
-    dreams = Dreams(centre)
-    dreams.ask_quietly()
-    due = dreams.due()
+    dreams.ask_quietly(centre)
+    due = dreams.due(centre)
     _clear_left(centre, due)
     for row in due:
-        with centre.lane(row["map"]) as is_ours:
-            if is_ours and not _is_asked_for(centre):
-                _dream_beside(centre, row, wait, stopped, scheduler)
+        with centre.lane(row.map) as is_ours:
+            if is_ours and not _is_needed(centre):
+                _dream_apart(centre, row, wait, stopped, scheduler)
                 return True
     return False
 
 
-def _clear_left(centre: Centre, due: list[dict[str, Any]]) -> None:
+def _clear_left(centre: Centre, due: list[Dream]) -> None:
     """Removes what killed dreams left that will not be resumed: copies of all robots' maps."""
-    names = {f"dream-{row['id']}" for row in due}
+    names = {f"dream-{row.id}" for row in due}
     for folder in (centre.folder / "work").glob("dream-*"):
         if folder.name not in names:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _dream_beside(
+def _dream_apart(
     centre: Centre,
-    row: dict[str, Any],
+    row: Dream,
     wait: Callable[[float], object],
     stopped: Callable[[], bool],
     scheduler: str | None,
 ) -> None:
     context = multiprocessing.get_context("spawn")
-    given = (centre.folder, *centre.addresses, row["id"], scheduler)
+    given = (centre.folder, *centre.addresses, row.id, scheduler)
     process = context.Process(target=_dream_here, args=given)
     process.start()
     gives_up = False
     try:
         while process.is_alive() and not gives_up:
             wait(centre.settings.poll_s)
-            gives_up = stopped() or _is_asked_for(centre) or not Dreams(centre).is_due(row)
+            gives_up = stopped() or _is_needed(centre) or not dreams.is_due(centre, row)
     finally:
         process.kill()
         process.join()
     if process.exitcode and not gives_up:
         fact = f"its process ended with exit code {process.exitcode}"
-        Dreams(centre).end(row, FAILED, error=fact)
+        jobs.set_state(centre, row, JobState.FAILED, error=fact)
 
 
-def _is_asked_for(centre: Centre) -> bool:
+def _is_needed(centre: Centre) -> bool:
     """Whether robots wait for a worker."""
-    handins = HandIns(centre)
-    return bool(Downloads(centre).asked()) or any(map(handins.waiting, centre.map_names()))
+    return bool(jobs.pending(centre, HandIn) or jobs.pending(centre, Artifact))
 
 
 def _dream_here(
@@ -210,54 +204,54 @@ def _dream_here(
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker ends it
     os.nice(_NICENESS)
     with Centre(folder, database, objects) as centre:
-        dream_of(centre, Dreams(centre).get(key), scheduler)
+        dream_of(centre, jobs.get(centre, Dream, key), scheduler)
 
 
-def dream_of(centre: Centre, row: dict[str, Any], scheduler: str | None = None) -> None:
+def dream_of(centre: Centre, row: Dream, scheduler: str | None = None) -> None:
     """Runs one dream to its end, and records the result in its row.
 
     A map that is being written to by hand, or a full disk, leaves the request pending.
     """
-    dreams, policy = Dreams(centre), centre.policy(row["map"])
+    policy = centre.policy(row.map)
     options = DreamOptions(scheduler=scheduler, merging=policy.merge)
-    drives = [Path(one) for one in policy.gate]
-    watching = Watching(partial(dreams.heartbeat, row["id"]))
-    path = centre.map_path(row["map"])
+    drives = [Path(drive) for drive in policy.gate]
+    monitor = JobMonitor(partial(jobs.heartbeat, centre, row))
+    path = centre.map_path(row.map)
     try:
-        with _scratch(centre.folder / "work" / f"dream-{row['id']}") as folder:
-            handed = list(_handed(centre, row["map"], folder))
-            report = dream(path, handed, drives, Settings(), options, watching)
+        with _scratch(centre.folder / "work" / f"dream-{row.id}") as folder:
+            robots = list(_maps_of_robots(centre, row.map, folder))
+            report = dream(path, robots, drives, Settings(), options, monitor)
     except (MapLockedError, StorageFullError):
         return
     except KeyboardInterrupt:
-        dreams.end(row, CANCELLED, error="cancelled")
+        jobs.set_state(centre, row, JobState.CANCELLED, error="cancelled")
         return
     except EngramError as error:
-        dreams.end(row, FAILED, error=centre.words_of(error))
+        jobs.set_state(centre, row, JobState.FAILED, error=centre.words_of(error))
         return
-    told = report.to_dict() | {"centre": row["map"]}
+    shown = report.to_dict() | {"centre": row.map}
     if report.added is None:
-        revision = _made_before(path, row["since"])
+        revision = _made_before(path, row.since)
     else:
-        revision, told["added"]["out"] = report.added.revision, row["map"]
-    dreams.end(row, DONE, revision=revision, report=told)
+        revision, shown["added"]["out"] = report.added.revision, row.map
+    jobs.set_state(centre, row, JobState.DONE, revision=revision, report=shown)
     if policy.moves is not None and revision is not None:
-        Refs(centre).move(row["map"], policy.moves, revision, "dream", None)
+        move_ref(centre, row.map, policy.moves, revision, "dream")
 
 
 def _made_before(path: Path, since: int) -> int | None:
     """The revision that this dream made before its process died; else None."""
     with Map.open(path) as store:
-        made = [one.number for one in store.log() if one.message.startswith("dream: ")]
-    return max((one for one in made if one > since), default=None)
+        log = [entry for entry in store.log() if entry.message.startswith("dream: ")]
+    return max((entry.number for entry in log if entry.number > since), default=None)
 
 
-def _handed(centre: Centre, name: str, folder: Path) -> Iterator[Path]:
+def _maps_of_robots(centre: Centre, name: str, folder: Path) -> Iterator[Path]:
     """Robots' maps as they were handed in, oldest first."""
-    dreams, limits = Dreams(centre), centre.settings
-    for number, row in enumerate(dreams.handed(name)):
-        path, manifest = folder / f"{number:04}.engram", dreams.manifest(row)
-        parts = dreams.parts(row, manifest)
+    limits = centre.settings
+    for number, row in enumerate(dreams.merged_handins(centre, name)):
+        path, manifest = folder / f"{number:04}.engram", handins.manifest_of(centre, row)
+        parts = dreams.parts_of(centre, row, manifest)
         admit(manifest, parts, path, limits.admission_bytes, limits.admission_s)
         yield path
 
@@ -279,7 +273,7 @@ _AGAIN_S = 10.0
 _HOUR_NS = 3_600_000_000_000
 
 
-def work_off(centre: Centre, take: Callable[[Centre, dict[str, Any]], None] = merge_apart) -> int:
+def work_off(centre: Centre, take: Callable[[Centre, HandIn], None] = merge_apart) -> int:
     """Does what there is to do; returns the number of settled jobs.
 
     Args:
@@ -290,16 +284,13 @@ def work_off(centre: Centre, take: Callable[[Centre, dict[str, Any]], None] = me
         EngramError: what hinders the centre; of each map, after all of them had their turn. Jobs
             wait.
     """
-    handins = HandIns(centre)
     settled, hindered = 0, list[EngramError]()
-    handins.expire()
-    Downloads(centre).expire()
-    for name in centre.map_names():
-        if not handins.waiting(name):
-            continue
+    handins.expire(centre)
+    downloads.expire(centre)
+    for name in dict.fromkeys(row.map for row in jobs.pending(centre, HandIn)):
         try:
             with centre.lane(name) as is_ours:
-                for row in handins.waiting(name) if is_ours else ():
+                for row in jobs.pending(centre, HandIn, name) if is_ours else ():
                     settled += _make_downloads(centre, hindered)
                     take(centre, row)
                     settled += 1
@@ -347,15 +338,15 @@ def work(
 
 def _make_downloads(centre: Centre, hindered: list[EngramError]) -> int:
     """Makes the requested downloads unless something hinders it: merging may take less room."""
-    downloads, made = Downloads(centre), 0
-    for name in {row["map"] for row in downloads.asked()}:
+    made = 0
+    for name in {row.map for row in jobs.pending(centre, Artifact)}:
         with centre.lane(f"{name}.downloads") as is_ours:
-            for row in downloads.asked() if is_ours else ():  # again: others made some meanwhile
-                if row["map"] != name or hindered:
-                    continue
+            # Looked up again: other workers made some meanwhile.
+            for row in jobs.pending(centre, Artifact, name) if is_ours and not hindered else ():
                 try:
-                    downloads.make(row)
+                    downloads.make(centre, row)
                     made += 1
                 except (StorageFullError, StoreError) as error:
                     hindered.append(error)
+                    break
     return made

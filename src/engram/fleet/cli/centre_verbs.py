@@ -16,6 +16,7 @@ from engram.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
     from engram.fleet.centre.service import Centre
+    from engram.fleet.centre.tables import Dream, HandIn
 
 
 Folder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="The centre's folder.")]
@@ -164,12 +165,15 @@ def dream(
     Examples:
       engram centre dream town
     """
-    from engram.fleet.centre.jobs import Dreams
+    from engram.fleet.centre import dreams, jobs
+    from engram.fleet.centre.tables import Dream, values_of
 
     with open_centre(folder, database) as centre:
-        dreams = Dreams(centre)
-        row = dreams.ask(map_name, BY) if cancel is None else dreams.cancel(dreams.get(cancel), BY)
-    typer.echo(json.dumps(row) if as_json else _told(row))
+        if cancel is None:
+            row = dreams.ask(centre, map_name, BY)
+        else:
+            row = jobs.cancel(centre, jobs.get(centre, Dream, cancel), BY)
+    typer.echo(json.dumps(values_of(row)) if as_json else _line(row))
 
 
 def jobs(
@@ -190,30 +194,31 @@ def jobs(
       engram centre jobs town
       engram centre jobs town --map campus --json
     """
-    from engram.fleet.centre.handins import HandIns
-    from engram.fleet.centre.jobs import Dreams
+    from engram.fleet.centre import dreams, handins
+    from engram.fleet.centre import jobs as any_job
+    from engram.fleet.centre.tables import HandIn, values_of
 
     with open_centre(folder, database) as centre:
         centre.map_row(map_name)
-        handins = HandIns(centre)
         if cancel is not None:
-            handins.cancel(handins.get(cancel), BY)
-        rows = handins.listed(map_name, None, None, 2**62, 1000)
-        dreamt = Dreams(centre).listed(map_name)
+            any_job.cancel(centre, any_job.get(centre, HandIn, cancel), BY)
+        rows = handins.listed(centre, map_name, limit=1000)
+        dreamt = dreams.listed(centre, map_name)
     if as_json:
-        print(json.dumps({"jobs": rows, "dreams": dreamt}))
+        listed = {"jobs": list(map(values_of, rows)), "dreams": list(map(values_of, dreamt))}
+        print(json.dumps(listed))
         return
     for row in reversed(rows):
-        typer.echo(_told(row))
-    for row in reversed(dreamt):
-        typer.echo(f"dream {_told(row)}")
+        typer.echo(_line(row))
+    for dreamed in reversed(dreamt):
+        typer.echo(f"dream {_line(dreamed)}")
 
 
-def _told(row: dict[str, Any]) -> str:
+def _line(row: HandIn | Dream) -> str:
     """A job on one line."""
-    fact = row["error"] or row["progress"] or ""
-    revision = "" if row["revision"] is None else f" revision {row['revision']}"
-    return f"{row['id']} {row['state']}{revision} {fact}".rstrip()
+    fact = row.error or row.progress or ""
+    revision = "" if row.revision is None else f" revision {row.revision}"
+    return f"{row.id} {row.state}{revision} {fact}".rstrip()
 
 
 def serve(
@@ -331,14 +336,14 @@ def token(
       engram centre token town --name alice --role operator
       engram centre token town --name alice --role none
     """
-    from engram.fleet.centre.access import Role, add_person, take_away
+    from engram.fleet.centre.access import Role, add_person, revoke_access
 
     roles = [str(one) for one in Role if one is not Role.ROBOT]
     if role not in {*roles, NONE}:
         raise ConfigError(f"--role {role!r} is unknown; known: {', '.join(roles)}, {NONE}")
     with open_centre(folder, database) as centre:
         if role == NONE:
-            typer.echo(f"access of {name} is revoked: {', '.join(take_away(centre, name, BY))}")
+            typer.echo(f"access of {name} is revoked: {', '.join(revoke_access(centre, name, BY))}")
         else:
             print(add_person(centre, name, map_name, Role(role)))
 

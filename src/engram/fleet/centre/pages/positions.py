@@ -39,7 +39,8 @@ def drawn(path: Path, version: str, revision: int) -> bytes:
     body: dict[str, Any] = {
         "revision": revision,
         "sessions": [
-            {"id": str(one.id), "robot": one.robot, "start_ns": one.start_ns} for one in sessions
+            {"id": str(session.id), "robot": session.robot, "start_ns": session.start_ns}
+            for session in sessions
         ],
         "nodes": found,
     }

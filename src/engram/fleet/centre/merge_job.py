@@ -27,7 +27,6 @@ from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
 
 from engram.counts import counted
 from engram.errors import (
@@ -39,10 +38,11 @@ from engram.errors import (
     StorageFullError,
     WorkerError,
 )
-from engram.fleet.centre.errors import MissingPartsError, StoreError
-from engram.fleet.centre.fleet import Refs
-from engram.fleet.centre.handins import HandIns, Parts
-from engram.fleet.centre.service import Centre, CentreSettings, HandInState, MapPolicy
+from engram.fleet.centre import handins, jobs
+from engram.fleet.centre.fleet import move_ref
+from engram.fleet.centre.problems import MissingPartsError, StoreError
+from engram.fleet.centre.service import Centre, CentreSettings
+from engram.fleet.centre.tables import HandIn, JobState
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.report import MergeReport
 from engram.fleet.transfers import Manifest, PartHash, join
@@ -153,19 +153,19 @@ def _lower(kind: int, soft: int, hard: int) -> None:
     resource.setrlimit(kind, (soft, hard))
 
 
-_TELL_S = 1.0
+_REPORT_S = 1.0
 
 
-class Watching(Monitor):
+class JobMonitor(Monitor):
     """Reports the progress of a job, and stops it if it is cancelled.
 
     Args:
-        tell: notes the progress; returns whether the job is to be cancelled.
+        report: notes the progress; returns whether the job is to be cancelled.
     """
 
-    def __init__(self, tell: Callable[[str], bool]) -> None:
-        self._tell = tell
-        self._told_s = 0.0
+    def __init__(self, report: Callable[[str], bool]) -> None:
+        self._report = report
+        self._reported_s = 0.0
         self._what, self._total, self._done = "", 0, 0
 
     @contextmanager
@@ -182,10 +182,10 @@ class Watching(Monitor):
     def check(self) -> None:
         """See `Monitor`."""
         now = time.monotonic()
-        if now - self._told_s < _TELL_S:
+        if now - self._reported_s < _REPORT_S:
             return
-        self._told_s = now
-        if self._tell(f"{self._what}: {self._done} of {self._total}"):
+        self._reported_s = now
+        if self._report(f"{self._what}: {self._done} of {self._total}"):
             raise KeyboardInterrupt
 
 
@@ -198,110 +198,99 @@ class WaitsError(EngramError):
     """A hand-in waits for the centre."""
 
 
-def merge_hand_in(centre: Centre, row: dict[str, Any]) -> None:
+def merge_hand_in(centre: Centre, row: HandIn) -> None:
     """Merges one complete hand-in.
 
     Raises:
         EngramError: what lies with the centre, and not with the hand-in, which waits: no space, a
             map that is being written to, a held-out drive that is gone.
     """
-    handins = HandIns(centre)
-    if row["tries"] >= centre.settings.merge_tries:
-        tries = counted(row["tries"], "time")
-        fact = f"its worker died {tries}; an operator may have it merged anyway"
-        clear_scratch(centre, row)
-        handins.end(row, HandInState.FAILED, error=fact)
-        return
-    handins.begun(row)
-    begun_s = time.monotonic()
     thin = _thin_map(centre, row)
+    if row.tries >= centre.settings.merge_tries:
+        tries = counted(row.tries, "time")
+        _clear(thin)
+        _end(centre, row, f"its worker died {tries}; an operator may have it merged anyway")
+        return
+    handins.note_try(centre, row)
+    begun_s = time.monotonic()
     try:
         with _scratch(thin):
             _admit(centre, row, thin)
-            outcome = _merged(centre, handins, row, thin)
-    except MissingPartsError:  # the map changed since they were asked for, by a revert
-        handins.end(row, HandInState.OPEN)
+            report = _merged(centre, row, thin)
+    except MissingPartsError:  # the map changed since they were requested, by a revert
+        jobs.set_state(centre, row, JobState.OPEN, tries=0)
     except RefusedError as error:
-        handins.end(row, HandInState.REFUSED, error=centre.words_of(error))
+        _end(centre, row, centre.words_of(error), JobState.REFUSED)
     except KilledError as error:  # this try counts: the map may be what takes the memory
-        raise WaitsError(f"{row['map']}: hand-in {row['id'][:8]} waits: {error}") from error
+        raise WaitsError(f"{row.map}: hand-in {row.id[:8]} waits: {error}") from error
     except (*_OF_THE_CENTRE, OSError) as error:
         fact = centre.words_of(error)
-        handins.put_off(row, fact)
-        raise WaitsError(f"{row['map']}: hand-in {row['id'][:8]} waits: {fact}") from error
+        handins.put_off(centre, row, fact)
+        raise WaitsError(f"{row.map}: hand-in {row.id[:8]} waits: {fact}") from error
     except KeyboardInterrupt:
-        if not handins.get(row["id"])["cancelled"]:
+        if not jobs.get(centre, HandIn, row.id).cancelled:
             raise
-        handins.end(row, HandInState.CANCELLED, error="cancelled")
+        _end(centre, row, "cancelled", JobState.CANCELLED)
     except EngramError as error:
-        handins.end(row, HandInState.FAILED, error=centre.words_of(error))
+        _end(centre, row, centre.words_of(error))
     except Exception as error:  # a stranger's map may bring about any: it ends this hand-in alone
-        _log.exception("%s: hand-in %s", row["map"], row["id"][:8])
-        fact = f"an unexpected fault, {centre.fault_of(error)}"
-        handins.end(row, HandInState.FAILED, error=fact)
+        _log.exception("%s: hand-in %s", row.map, row.id[:8])
+        _end(centre, row, f"an unexpected fault, {centre.fault_of(error)}")
     else:
-        _settle(centre, handins, row, outcome)
+        _settle(centre, row, report)
         took_s = time.monotonic() - begun_s
-        _log.info("%s: hand-in %s took %.1f s of work", row["map"], row["id"][:8], took_s)
+        _log.info("%s: hand-in %s took %.1f s of work", row.map, row.id[:8], took_s)
 
 
-def _admit(centre: Centre, row: dict[str, Any], thin: Path) -> None:
-    parts, limits = Parts(centre), centre.settings
-    manifest = parts.manifest(row)
-    admit(
-        manifest,
-        parts.source(row, manifest),
-        thin,
-        limits.admission_bytes,
-        limits.admission_s,
-    )
+def _end(centre: Centre, row: HandIn, why: str, state: JobState = JobState.FAILED) -> None:
+    jobs.set_state(centre, row, state, error=why)
 
 
-def _merged(centre: Centre, handins: HandIns, row: dict[str, Any], thin: Path) -> MergeReport:
-    policy = centre.policy(row["map"])
+def _admit(centre: Centre, row: HandIn, thin: Path) -> None:
+    manifest, limits = handins.manifest_of(centre, row), centre.settings
+    parts = handins.parts_to_merge(centre, row, manifest)
+    admit(manifest, parts, thin, limits.admission_bytes, limits.admission_s)
+
+
+def _merged(centre: Centre, row: HandIn, thin: Path) -> MergeReport:
+    policy = centre.policy(row.map)
     (report,) = merge(
-        centre.map_path(row["map"]),
+        centre.map_path(row.map),
         [thin],
         policy.merge,
-        Watching(partial(handins.heartbeat, row["id"])),
+        JobMonitor(partial(jobs.heartbeat, centre, row)),
         settings=Settings(),
-        require_better=[] if row["ungated"] else [Path(one) for one in policy.gate],
+        require_better=[] if row.ungated else [Path(drive) for drive in policy.gate],
     )
     return report
 
 
-def _settle(centre: Centre, handins: HandIns, row: dict[str, Any], report: MergeReport) -> None:
+def _settle(centre: Centre, row: HandIn, report: MergeReport) -> None:
     if report.interrupted:
-        handins.end(row, HandInState.CANCELLED, error="cancelled")
+        _end(centre, row, "cancelled", JobState.CANCELLED)
         return
-    told = {**report.to_dict(), "source": f"hand-in {row['id']}"}
+    shown = {**report.to_dict(), "source": f"hand-in {row.id}"}
     revision = report.revision
     if revision is None:  # nothing new; or a worker died between the merge and this row
-        revision = _revision_of(centre.map_path(row["map"]), row["content_hash"])
-        report.revision = revision
-    handins.end(row, HandInState.MERGED, revision=revision, report=told)
-    policy: MapPolicy = centre.policy(row["map"])
-    if policy.moves is not None and revision and not row["ungated"]:
-        Refs(centre).move(row["map"], policy.moves, revision, "gate", None)
+        revision = _revision_of(centre.map_path(row.map), row.content_hash)
+    jobs.set_state(centre, row, JobState.MERGED, revision=revision, report=shown)
+    policy = centre.policy(row.map)
+    if policy.moves is not None and revision and not row.ungated:
+        move_ref(centre, row.map, policy.moves, revision, "gate")
 
 
 def _revision_of(path: Path, content_hash: str) -> int:
     """The revision that holds a map of this content: the one that merged it, or the newest."""
     with Map.open(path) as store:
-        for one in store.log():
-            merged = one.configuration.get("merge")
+        for entry in store.log():
+            merged = entry.configuration.get("merge")
             if isinstance(merged, dict) and merged.get("source") == content_hash:
-                return one.number
+                return entry.number
         return store.revision
 
 
-def clear_scratch(centre: Centre, row: dict[str, Any]) -> None:
-    """Removes what a killed merge of a hand-in left next to the maps."""
-    _clear(_thin_map(centre, row))
-
-
-def _thin_map(centre: Centre, row: dict[str, Any]) -> Path:
-    return centre.folder / "work" / f"{row['id']}.engram"
+def _thin_map(centre: Centre, row: HandIn) -> Path:
+    return centre.folder / "work" / f"{row.id}.engram"
 
 
 @contextmanager
@@ -315,15 +304,15 @@ def _scratch(path: Path) -> Iterator[None]:
 
 
 def _clear(path: Path) -> None:
-    for one in path.parent.glob(f"{path.name}*"):
-        one.unlink()
+    for left in path.parent.glob(f"{path.name}*"):
+        left.unlink()
 
 
 # Chosen first by a system that is out of memory, before the worker and the service.
 _FIRST_TO_GO = "1000"
 
 
-def merge_apart(centre: Centre, row: dict[str, Any]) -> None:
+def merge_apart(centre: Centre, row: HandIn) -> None:
     """Merges one complete hand-in, as `merge_hand_in` does.
 
     Raises:
@@ -332,12 +321,15 @@ def merge_apart(centre: Centre, row: dict[str, Any]) -> None:
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
     pipe, theirs = context.Pipe(duplex=False)
-    given = (theirs, centre.folder, centre.addresses, centre.settings, row["id"])
+    given = (theirs, centre.folder, centre.addresses, centre.settings, row.id)
     process = context.Process(target=_merge, args=given)
     process.start()
     theirs.close()
+    waits_for = ""
     try:
-        waits_for = _told(pipe)
+        waits_for = pipe.recv()
+    except (EOFError, OSError):  # the hand-in has ended, or its process
+        pass
     except BaseException:
         process.kill()
         raise
@@ -346,27 +338,19 @@ def merge_apart(centre: Centre, row: dict[str, Any]) -> None:
         process.join()
     if waits_for:
         raise WaitsError(waits_for)
-    if HandIns(centre).get(row["id"])["state"] == HandInState.COMPLETE:
+    row = jobs.get(centre, HandIn, row.id)
+    if row.state == JobState.COMPLETE:
         _end_killer(centre, row, process)
 
 
-def _told(pipe: Connection) -> str:
-    """What the hand-in waits for; empty if it has ended, or its process."""
-    try:
-        waits_for: str = pipe.recv()
-    except (EOFError, OSError):
-        return ""
-    return waits_for
-
-
-def _end_killer(centre: Centre, row: dict[str, Any], process: BaseProcess) -> None:
+def _end_killer(centre: Centre, row: HandIn, process: BaseProcess) -> None:
     """Ends a hand-in whose process died."""
     code = process.exitcode or 0
     how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"
     fact = f"the process that merged it ended {how}; an operator may have it merged anyway"
-    _log.error("%s: hand-in %s: %s", row["map"], row["id"][:8], fact)
-    clear_scratch(centre, row)
-    HandIns(centre).end(row, HandInState.FAILED, error=fact)
+    _log.error("%s: hand-in %s: %s", row.map, row.id[:8], fact)
+    _clear(_thin_map(centre, row))
+    _end(centre, row, fact)
 
 
 def _merge(
@@ -383,6 +367,6 @@ def _merge(
         Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO)
     with logging_to_stderr(), Centre(folder, *addresses, settings) as centre:
         try:
-            merge_hand_in(centre, HandIns(centre).get(key))
+            merge_hand_in(centre, jobs.get(centre, HandIn, key))
         except (EngramError, OSError) as error:
             pipe.send(centre.words_of(error))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.responses import PlainTextResponse
@@ -14,12 +13,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from engram import __version__
 from engram.fleet.centre import transfer_routes
-from engram.fleet.centre.database import artifacts, dreams, handins
 from engram.fleet.centre.models import Health
-from engram.fleet.centre.pages import routes as pages
+from engram.fleet.centre.pages import page_routes as pages
 from engram.fleet.centre.requests import DESCRIBED, CentreHere, add_problems
 from engram.fleet.centre.routes import maps_router, robots_router
 from engram.fleet.centre.service import Centre
+from engram.fleet.centre.tables import artifacts, dreams, handins
 
 _ABOUT = """The fleet's shared map as a service: robots hand in what they saw, and download what the
 next mission needs. Errors are problem details (RFC 9457). Whatever is sent twice is done once."""
@@ -45,7 +44,7 @@ def create_app(centre: Centre) -> FastAPI:
     for router in (maps_router, robots_router, transfer_routes.router):
         app.include_router(router, prefix="/v1")
     app.include_router(pages.router)
-    app.add_api_route("/v1/health", _health, response_model=Health, tags=["service"])
+    app.add_api_route("/v1/health", _health, tags=["service"])
     app.add_api_route("/v1/metrics", _metrics, tags=["service"], response_class=PlainTextResponse)
     app.add_middleware(_Counting)
     return app
@@ -88,11 +87,11 @@ class _Counting:
         await self._app(scope, request, answer)
 
 
-def _health(centre: CentreHere) -> dict[str, Any]:
+def _health(centre: CentreHere) -> Health:
     """Whether the service answers and reaches its database; nothing about maps."""
     with centre.database.reading() as connection:
         connection.execute(select(1))
-    return {"status": "ok", "version": __version__}
+    return Health(status="ok", version=__version__)
 
 
 def _metrics(request: Request, centre: CentreHere) -> str:

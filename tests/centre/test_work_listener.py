@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from engram.fleet.centre.database import Waker, ring
+from engram.fleet.centre.database import WorkListener, notify
 
 from .conftest import drive
 
@@ -31,10 +31,10 @@ def database(site) -> str:
 
 def test_without_announcements_a_worker_looks_after_a_while(tmp_path):
     slept: list[float] = []
-    with Waker(f"sqlite:///{tmp_path / 'centre.sqlite'}", slept.append) as waker:
-        waker.wait(3.0)
-    with Waker(None, slept.append) as waker:
-        waker.wait(4.0)
+    with WorkListener(f"sqlite:///{tmp_path / 'centre.sqlite'}", slept.append) as listener:
+        listener.wait(3.0)
+    with WorkListener(None, slept.append) as listener:
+        listener.wait(4.0)
     assert slept == [3.0, 4.0]
 
 
@@ -42,8 +42,8 @@ def test_where_the_database_is_away_a_worker_looks_after_a_while():
     pytest.importorskip("psycopg")
     slept: list[float] = []
     nowhere = "postgresql+psycopg://engram@/postgres?host=/nowhere"
-    with Waker(nowhere, slept.append) as waker:
-        waker.wait(3.0)
+    with WorkListener(nowhere, slept.append) as listener:
+        listener.wait(3.0)
     assert slept == [3.0]
 
 
@@ -52,12 +52,12 @@ def test_a_complete_hand_in_wakes_a_worker(site, database):
     agent = site.robot("r1")
     drive(agent.live, "r1", 1_000)
     agent.hand_in()
-    with Waker(database, time.sleep) as waker:
-        waker.wait(_LONG_S)  # only begins to listen
+    with WorkListener(database, time.sleep) as listener:
+        listener.wait(_LONG_S)  # only begins to listen
         sender = threading.Thread(target=agent.step, kwargs={"fetch": False})
         started = time.monotonic()
         sender.start()
-        waker.wait(_LONG_S)
+        listener.wait(_LONG_S)
         assert time.monotonic() - started < _LONG_S / 2
         sender.join()
 
@@ -65,14 +65,14 @@ def test_a_complete_hand_in_wakes_a_worker(site, database):
 @needs_postgresql
 def test_a_broken_line_is_taken_up_again(site, database):
     slept: list[float] = []
-    with Waker(database, slept.append) as waker:
-        waker.wait(_LONG_S)
-        waker._line.close()
-        waker.wait(_LONG_S)
+    with WorkListener(database, slept.append) as listener:
+        listener.wait(_LONG_S)
+        listener._connection.close()
+        listener.wait(_LONG_S)
         assert slept == [_LONG_S]
-        waker.wait(_LONG_S)
+        listener.wait(_LONG_S)
         with site.centre.database.writing() as connection:
-            ring(connection)
+            notify(connection)
         started = time.monotonic()
-        waker.wait(_LONG_S)
+        listener.wait(_LONG_S)
         assert time.monotonic() - started < _LONG_S / 2

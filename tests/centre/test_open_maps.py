@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from engram.errors import EngramError
-from engram.fleet.centre.errors import UnknownError
+from engram.fleet.centre.problems import UnknownError
 from engram.fleet.centre.service import log_of
 
 from .conftest import NAME, drive

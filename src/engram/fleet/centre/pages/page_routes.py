@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from datetime import UTC, datetime
 from importlib.resources import files
@@ -14,15 +13,15 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
+from engram.fleet.centre import dreams, handins, jobs
 from engram.fleet.centre.access import Role, Subject, names_of, subject_of
 from engram.fleet.centre.database import first_broken, newest_events
-from engram.fleet.centre.errors import CentreError, UnknownError
-from engram.fleet.centre.fleet import Fleet, Refs
-from engram.fleet.centre.handins import HandIns
-from engram.fleet.centre.jobs import Downloads, Dreams
+from engram.fleet.centre.fleet import refs_of, revision_of, robots_of, version_of
 from engram.fleet.centre.pages.positions import drawn, thumbnail
+from engram.fleet.centre.problems import CentreError, UnknownError
 from engram.fleet.centre.requests import COOKIE, Asking, CentreHere, takes, who_asks
 from engram.fleet.centre.service import Centre
+from engram.fleet.centre.tables import Artifact, HandIn, values_of
 from engram.maps.history import map_log
 from engram.untrusted import printable
 
@@ -116,9 +115,8 @@ def map_page(name: str, centre: CentreHere, who: Asking) -> Response:
 @router.get("/maps/{name}/nodes", dependencies=VIEWERS)
 def nodes(name: str, centre: CentreHere, at: int | None = None) -> Response:
     """What the map page draws."""
-    refs = Refs(centre)
-    revision = refs.revision(name, "head" if at is None else str(max(at, 0)))
-    body = drawn(centre.map_path(name), refs.version(name, revision), revision)
+    revision = revision_of(centre, name, "head" if at is None else str(max(at, 0)))
+    body = drawn(centre.map_path(name), version_of(centre, name, revision), revision)
     return Response(body, media_type="application/json")
 
 
@@ -139,17 +137,16 @@ def picture(
 @router.get("/maps/{name}/history", dependencies=VIEWERS)
 def history(name: str, centre: CentreHere, who: Asking) -> Response:
     """Revisions, what merged them, refs."""
-    rows = HandIns(centre).listed(name, None, None, 2**62, _SHOWN)
-    reports = {row["revision"]: _report(row) for row in rows if row["report"] is not None}
+    rows = handins.listed(centre, name, limit=_SHOWN)
     return _page(
         "history",
         who,
         map=name,
         maps=_maps(centre, who),
         log=map_log(centre.map_path(name))[:_SHOWN],
-        refs=Refs(centre).all(name),
+        refs=refs_of(centre, name),
         names=names_of(centre),
-        reports=reports,
+        reports={row.revision: row.report for row in rows if row.report is not None},
         may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
     )
 
@@ -158,14 +155,15 @@ def history(name: str, centre: CentreHere, who: Asking) -> Response:
 def robots(name: str, centre: CentreHere, who: Asking) -> Response:
     """What every robot runs, and wants."""
     rows, named = [], Counter[str]()
-    for row in Fleet(centre).all(name):
+    for row in robots_of(centre, name):
         try:
-            revision = Refs(centre).revision(name, row["follows"])
-            wanted = Refs(centre).version(name, revision)
+            revision = revision_of(centre, name, row.follows)
+            wanted = version_of(centre, name, revision)
         except UnknownError:
             revision, wanted = None, None
-        named[row["name"]] += 1
-        rows.append({**row, "wanted": revision, "up_to_date": row["report"].get("runs") == wanted})
+        named[row.name] += 1
+        up_to_date = row.report.get("runs") == wanted
+        rows.append({**values_of(row), "wanted": revision, "up_to_date": up_to_date})
     return _page(
         "robots",
         who,
@@ -173,7 +171,7 @@ def robots(name: str, centre: CentreHere, who: Asking) -> Response:
         maps=_maps(centre, who),
         robots=rows,
         named=named,
-        refs=[one["name"] for one in Refs(centre).all(name)],
+        refs=[ref.name for ref in refs_of(centre, name)],
         may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
     )
 
@@ -181,18 +179,15 @@ def robots(name: str, centre: CentreHere, who: Asking) -> Response:
 @router.get("/maps/{name}/queue", dependencies=VIEWERS)
 def queue(name: str, centre: CentreHere, who: Asking) -> Response:
     """Hand-ins and downloads, with their results."""
-    rows = HandIns(centre).listed(name, None, None, 2**62, _SHOWN)
-    asked = [row for row in Downloads(centre).asked() if row["map"] == name]
-    jobs = [{**row, "report": _report(row)} for row in rows]
     return _page(
         "queue",
         who,
         map=name,
         maps=_maps(centre, who),
-        jobs=jobs,
-        downloads=asked,
-        dreams=[{**row, "report": _report(row)} for row in Dreams(centre).listed(name)],
-        robots={row["robot"]: row["name"] for row in Fleet(centre).all(name)},
+        jobs=handins.listed(centre, name, limit=_SHOWN),
+        downloads=jobs.pending(centre, Artifact, name),
+        dreams=dreams.listed(centre, name),
+        robots={row.robot: row.name for row in robots_of(centre, name)},
         may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
     )
 
@@ -203,8 +198,7 @@ def health(name: str, centre: CentreHere, who: Asking) -> Response:
     with centre.database.reading() as connection:
         broken = first_broken(connection)
         events = newest_events(connection, name, _SHOWN)
-    waiting, fleet = HandIns(centre).waiting(name), Fleet(centre).all(name)
-    path = centre.map_path(name)
+        path = centre.map_path(name)
     return _page(
         "health",
         who,
@@ -212,10 +206,10 @@ def health(name: str, centre: CentreHere, who: Asking) -> Response:
         maps=_maps(centre, who),
         broken=broken,
         events=events,
-        waiting=waiting,
+        waiting=jobs.pending(centre, HandIn, name),
         size_bytes=path.stat().st_size if path.exists() else 0,
         row=centre.map_row(name),
-        silent=[one for one in fleet if one["reported_ns"] is None],
+        silent=[row for row in robots_of(centre, name) if row.reported_ns is None],
         names=names_of(centre),
     )
 
@@ -223,7 +217,3 @@ def health(name: str, centre: CentreHere, who: Asking) -> Response:
 def _maps(centre: Centre, who: Subject) -> list[str]:
     allowed = {Role.VIEWER, Role.OPERATOR, Role.ADMIN}
     return [name for name in centre.map_names() if who.role_on(name) in allowed]
-
-
-def _report(row: dict[str, Any]) -> dict[str, Any] | None:
-    return None if row["report"] is None else json.loads(row["report"])
