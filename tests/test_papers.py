@@ -19,8 +19,8 @@ from tests.worlds import covariance_of, forward, make_edge
 from engram.cli.options import Effort
 from engram.cli.settings import every_setting, read_settings
 from engram.fleet.cli.verbs import _judge, merging_of
+from engram.fleet.merge.merge_settings import MergeOptions, SeedFrom, Unit
 from engram.fleet.merge.report import Reason
-from engram.fleet.merge.settings import MergeOptions, SeedFrom, Unit
 from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, path_id

@@ -19,7 +19,7 @@ from engram.errors import EngramError
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.sequences.framelog.reader import FrameLog
-from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.framelog.log_writer import FrameLogWriter
 from tests.sequences.test_framelog import log_header
 
 folder = Path(sys.argv[1])

@@ -12,7 +12,7 @@ from tests.sequences.synthetic import only_engram_errors, write_log
 
 from engram.errors import SequenceError
 from engram.geometry.se3 import SE3
-from engram.sequences.motion import Trajectory, write_tum
+from engram.sequences.motion_files import Trajectory, write_tum
 from engram.sequences.opening import open_drive
 from engram_lab.truth import (
     read_euroc_truth,

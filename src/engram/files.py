@@ -190,7 +190,7 @@ def check_output(path: Path) -> None:
 def check_output_folder(path: Path) -> None:
     """Refuse, before the work, a folder that could not be made and filled at its end."""
     try:
-        there = next(one for one in (path, *path.absolute().parents) if one.exists())
+        there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
         if not there.is_dir():
             raise InputError(f"{path} cannot be a folder: {there} is a file")
         _try_folder(there)

@@ -23,9 +23,9 @@ def keywords(**meant: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
 
     def checked(function: Callable[_P, _T]) -> Callable[_P, _T]:
         known = [
-            one.name
-            for one in inspect.signature(function).parameters.values()
-            if one.name != "self" and one.kind is not one.POSITIONAL_ONLY
+            parameter.name
+            for parameter in inspect.signature(function).parameters.values()
+            if parameter.name != "self" and parameter.kind is not parameter.POSITIONAL_ONLY
         ]
 
         @wraps(function)

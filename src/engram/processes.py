@@ -77,17 +77,17 @@ def run_in_processes(
                 running.append(_start(work, name, tasks[name]))
             _listen(running, monitor)
             monitor.check()
-            for one in [one for one in running if not one.process.is_alive()]:
-                _hear(one, monitor)
-                running.remove(one)
-                one.pipe.close()
-                if one.outcome is None:
-                    _count_death(one, retries)
-                    waiting.insert(0, one.name)
-                elif isinstance(one.outcome, Exception):
-                    raise one.outcome
+            for worker in [worker for worker in running if not worker.process.is_alive()]:
+                _hear(worker, monitor)
+                running.remove(worker)
+                worker.pipe.close()
+                if worker.outcome is None:
+                    _count_death(worker, retries)
+                    waiting.insert(0, worker.name)
+                elif isinstance(worker.outcome, Exception):
+                    raise worker.outcome
                 else:
-                    done(one.name, one.outcome[0], retries[one.name])
+                    done(worker.name, worker.outcome[0], retries[worker.name])
 
 
 @dataclass(slots=True)
@@ -98,12 +98,12 @@ class _Running:
     outcome: tuple[Any] | Exception | None = None
 
 
-def _count_death(one: _Running, retries: dict[str, int]) -> None:
-    retries[one.name] += 1
-    if retries[one.name] > MAX_RETRIES:
+def _count_death(worker: _Running, retries: dict[str, int]) -> None:
+    retries[worker.name] += 1
+    if retries[worker.name] > MAX_RETRIES:
         raise WorkerError(
-            f"the worker of {one.name} died {MAX_RETRIES + 1} times, last with exit code "
-            f"{one.process.exitcode}; progress is kept: give the same command again, with fewer "
+            f"the worker of {worker.name} died {MAX_RETRIES + 1} times, last with exit code "
+            f"{worker.process.exitcode}; progress is kept: give the same command again, with fewer "
             "workers if memory was short"
         )
 
@@ -115,10 +115,10 @@ def _team() -> Iterator[list[_Running]]:
     try:
         yield running
     finally:
-        for one in running:
-            one.process.terminate()
-        for one in running:
-            one.process.join()
+        for worker in running:
+            worker.process.terminate()
+        for worker in running:
+            worker.process.join()
 
 
 def _start(work: Callable[[Task, Monitor], Result], name: str, task: Task) -> _Running:
@@ -138,36 +138,37 @@ def _work(work: Callable[[Task, Monitor], Result], task: Task, pipe: Connection)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     cv2.setNumThreads(1)  # the tasks run side by side
-    told = WordsTogether(pipe.send)
+    words = WordsTogether(pipe.send)
     try:
-        outcome: tuple[Result] | EngramError = (work(task, told),)
+        outcome: tuple[Result] | EngramError = (work(task, words),)
     except EngramError as error:
         outcome = error
-    pipe.send(told.take())
+    pipe.send(words.take())
     pipe.send(outcome)
     pipe.close()
 
 
 def _listen(running: Sequence[_Running], monitor: Monitor) -> None:
     ready = wait(
-        [one.pipe for one in running] + [one.process.sentinel for one in running], LISTEN_S
+        [worker.pipe for worker in running] + [worker.process.sentinel for worker in running],
+        LISTEN_S,
     )
-    for one in running:
-        if one.pipe in ready:
-            _hear(one, monitor)
+    for worker in running:
+        if worker.pipe in ready:
+            _hear(worker, monitor)
 
 
-def _hear(one: _Running, monitor: Monitor) -> None:
+def _hear(worker: _Running, monitor: Monitor) -> None:
     try:
-        while one.pipe.poll():
-            said = one.pipe.recv()
-            if isinstance(said, list):
-                for word in said:
+        while worker.pipe.poll():
+            message = worker.pipe.recv()
+            if isinstance(message, list):
+                for word in message:
                     monitor.advance(word)
             else:
-                one.outcome = said
+                worker.outcome = message
     except (EOFError, OSError):  # the worker has ended or was killed within a message
-        one.process.join()
+        worker.process.join()
 
 
 def end_with_parent() -> None:

@@ -103,7 +103,7 @@ class SqliteFile:
         """Refuses files on which SQLite would block, or that it would take for an empty one."""
         noun, strange = self.kind.noun, self.kind.strange
         try:
-            found = self.path.stat()
+            status = self.path.stat()
         except (FileNotFoundError, NotADirectoryError) as error:
             if may_be_new:
                 self._check_place()
@@ -111,13 +111,13 @@ class SqliteFile:
             raise strange(f"{self.path}: there is no such file") from error
         except OSError as error:
             raise MapError(f"{self.path} cannot be read: {error.strerror}") from error
-        if stat.S_ISDIR(found.st_mode):
+        if stat.S_ISDIR(status.st_mode):
             raise strange(f"{self.path} is a folder, not a {noun}")
-        if not stat.S_ISREG(found.st_mode):
+        if not stat.S_ISREG(status.st_mode):
             raise strange(f"{self.path} is a pipe, a socket or a device, not a {noun}")
         if not os.access(self.path, os.R_OK):
             raise MapError(f"{self.path} cannot be read: permission denied")
-        if not found.st_size and not may_be_new:
+        if not status.st_size and not may_be_new:
             raise strange(f"{self.path} is an empty file, not a {noun}")
 
     def _check_place(self) -> None:
@@ -174,18 +174,18 @@ class SqliteFile:
                     f"{self.kind.cure}"
                 )
         found = execute("SELECT type, name FROM sqlite_schema WHERE type != 'index'").fetchall()
-        here = {(str(kind), str(name)) for kind, name in found}
+        present = {(str(kind), str(name)) for kind, name in found}
         wanted = {("table", name) for name in self.kind.metadata.tables}
-        if here != wanted:
+        if present != wanted:
             raise MapCorruptError(
-                f"{self.path}: not the tables of its format: missing {sorted(wanted - here)}, "
-                f"unexpected {sorted(here - wanted)}"
+                f"{self.path}: not the tables of its format: missing {sorted(wanted - present)}, "
+                f"unexpected {sorted(present - wanted)}"
             )
         columns: dict[str, list[tuple[str, int]]] = {}
         for table, column, hidden in execute(_COLUMNS).fetchall():
             columns.setdefault(table, []).append((column, hidden))
         for name, table in self.kind.metadata.tables.items():
-            if columns[name] != [(one.name, 0) for one in table.columns]:
+            if columns[name] != [(column.name, 0) for column in table.columns]:
                 raise MapCorruptError(f"{self.path}: table {name} has the columns {columns[name]}")
 
     def connect(self, options: str) -> sqlite3.Connection:

@@ -59,6 +59,8 @@ def printable(text: str) -> str:
     if _PLAIN.fullmatch(text):
         return text
     return "".join(
-        one if one == "\n" or unicodedata.category(one) not in {"Cc", "Cf", "Cs", "Co"} else "�"
-        for one in text
+        character
+        if character == "\n" or unicodedata.category(character) not in {"Cc", "Cf", "Cs", "Co"}
+        else "�"
+        for character in text
     )

@@ -22,7 +22,7 @@ from engram.fleet.centre.application import create_app
 from engram.fleet.centre.merge_job import write_checked
 from engram.fleet.centre.service import Centre, MapPolicy
 from engram.fleet.centre.worker import work_off
-from engram.fleet.merge.settings import MergeOptions
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.maps.map import Map, open_map
 
 from .faults import FlakyClient

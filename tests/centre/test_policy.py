@@ -11,7 +11,7 @@ from engram.cli.settings import AllSettings
 from engram.errors import FormatVersionError
 from engram.fleet.centre.service import Centre, MapPolicy
 from engram.fleet.centre.tables import centre
-from engram.fleet.merge.settings import MergeOptions
+from engram.fleet.merge.merge_settings import MergeOptions
 
 from .conftest import drive
 

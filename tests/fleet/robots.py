@@ -11,16 +11,16 @@ import numpy as np
 from tests.mapping_rig import Mapped, map_simulated
 from tests.synthetic_world import World, drive
 
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.report import MergeReport
-from engram.fleet.merge.settings import MergeOptions
 from engram.frontend.frame import DescriptorKind
 from engram.geometry.se3 import SE3
 from engram.graph.model import Clock, NodeId, Session
 from engram.maps.map import Map
 from engram.maps.records import StoredNode
 from engram.sequences.framelog.file import FrameLogHeader
-from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.framelog.log_writer import FrameLogWriter
 from engram.sequences.sequence import LoggedFrame, SequenceInfo
 
 DAY_NS = 86_400_000_000_000

@@ -7,7 +7,7 @@ from itertools import combinations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engram.fleet.merge.state import Span, overlapping
+from engram.fleet.merge.open_merge import Span, overlapping
 from engram.testing.contracts import session_record
 
 # Short spans on a short time line: many touch, many begin together.

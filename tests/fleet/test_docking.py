@@ -31,9 +31,9 @@ from engram.errors import (
 )
 from engram.fleet.merge import gate, merging
 from engram.fleet.merge.gate import check_held_out, what_is_worse
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, SegmentReport
-from engram.fleet.merge.settings import MergeOptions
 from engram.frontend.frame import TEBLID
 from engram.geometry.se3 import SE3
 from engram.graph.model import Clock, NodeId, Omission, SessionId

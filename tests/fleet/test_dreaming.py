@@ -38,7 +38,7 @@ from engram.measures import Drive
 from engram.monitor import Monitor
 from engram.robot.settings import RobotOptions, Settings
 from engram.sequences.framelog.file import FrameLogHeader
-from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.framelog.log_writer import FrameLogWriter
 from engram.sequences.sequence import SequenceInfo
 
 from .robots import DAY_NS, OPTIONS, merged

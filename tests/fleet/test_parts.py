@@ -9,7 +9,7 @@ from uuid import UUID
 import numpy as np
 import pytest
 
-from engram.fleet.merge.state import Merge
+from engram.fleet.merge.open_merge import Merge
 from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.maps.map import Map

@@ -16,7 +16,7 @@ from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.robot.anchors import add_goal, anchor_map, list_goals, read_anchors, remove_goal
 from engram.robot.inspecting import Exported, export_map
-from engram.sequences.motion import read_tum
+from engram.sequences.motion_files import read_tum
 
 PLACES_M = np.arange(0.0, 20.0, 1.0)
 METRES_PER_DEGREE = 111_320 * np.cos(np.deg2rad(50.0))

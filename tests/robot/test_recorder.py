@@ -18,8 +18,8 @@ from engram.robot.front import Front
 from engram.robot.recorder import Recorder, RecorderConfig
 from engram.robot.settings import Settings
 from engram.robot.starting import localise_drive
+from engram.sequences.framelog.log_writer import read_decisions, read_images, read_report
 from engram.sequences.framelog.reader import FrameLog
-from engram.sequences.framelog.writer import read_decisions, read_images, read_report
 from engram.sequences.opening import open_drive
 from engram_lab.bench.data import synthetic_drive
 

@@ -18,7 +18,7 @@ from engram.geometry.se3 import SE3
 from engram.graph.model import Clock
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.sequences.framelog.file import FrameLogHeader
-from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.framelog.log_writer import FrameLogWriter
 from engram.sequences.sequence import LoggedFrame, SequenceInfo, first_pair_hash
 
 WIDTH, HEIGHT, PAIRS = 48, 32, 6

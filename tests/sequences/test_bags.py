@@ -20,8 +20,8 @@ from engram.errors import (
 )
 from engram.graph.model import Clock
 from engram.sequences.bags import messages
+from engram.sequences.bags.bag_sequence import BagSequence, describe_bag, learnt_tolerance
 from engram.sequences.bags.containers import Bag
-from engram.sequences.bags.sequence import BagSequence, describe_bag, learnt_tolerance
 from engram.sequences.opening import open_drive
 
 from .bag_maker import (

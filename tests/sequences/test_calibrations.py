@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from engram.calibration.cameras import Cameras, read_yaml, rectified_cameras
+from engram.calibration.calibrated_pair import Cameras, read_yaml, rectified_cameras
 from engram.calibration.formats import read_calibration
 from engram.calibration.toml import calibration_toml, parse_toml
 from engram.errors import CalibrationError, ConfigError
@@ -18,7 +18,7 @@ from engram.frontend.frame import StereoPair
 from engram.frontend.frontend import Frontend
 from engram.geometry.rectification import DistortionModel, RawCamera, RawStereoCalibration
 from engram.geometry.se3 import SE3
-from engram.sequences.bags.sequence import BagSequence, describe_bag
+from engram.sequences.bags.bag_sequence import BagSequence, describe_bag
 from engram.sequences.opening import open_drive
 from engram.sequences.sequence import OpenOptions
 from engram_lab.bench.data import synthetic_drive

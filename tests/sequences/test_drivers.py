@@ -18,8 +18,8 @@ from engram.errors import CalibrationError, SequenceError
 from engram.frontend.frame import StereoPair
 from engram.geometry.se3 import SE3
 from engram.sequences.bags import containers
+from engram.sequences.bags.bag_sequence import BagSequence, describe_bag
 from engram.sequences.bags.containers import Bag, Record
-from engram.sequences.bags.sequence import BagSequence, describe_bag
 from engram.sequences.opening import open_drive
 from engram_lab.bench.data import synthetic_drive
 

@@ -27,8 +27,8 @@ from engram.errors import (
 from engram.geometry.se3 import SE3, propagate_covariance
 from engram.graph.model import Clock
 from engram.odometry.step import OdometryStatus
+from engram.sequences.framelog.log_writer import FrameLogWriter
 from engram.sequences.framelog.reader import FrameLog
-from engram.sequences.framelog.writer import FrameLogWriter
 from engram.sequences.opening import open_drive
 from engram.sequences.sequence import FrameRange, LoggedFrame
 

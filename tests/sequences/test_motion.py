@@ -10,8 +10,8 @@ import pytest
 
 from engram.errors import SequenceError
 from engram.geometry.se3 import SE3
-from engram.sequences.bags.sequence import describe_bag
-from engram.sequences.motion import FORWARD, read_samples
+from engram.sequences.bags.bag_sequence import describe_bag
+from engram.sequences.motion_files import FORWARD, read_samples
 from engram.sequences.opening import open_drive
 
 from .bag_maker import KINDS, LEFT, RIGHT, bag, made, rectified_infos

@@ -12,7 +12,7 @@ from engram.frontend.frontend import Frontend
 from engram.graph.model import Clock
 from engram.odometry.odometry import Odometry
 from engram.sequences.framelog.file import FrameLogHeader
-from engram.sequences.framelog.writer import FrameLogWriter
+from engram.sequences.framelog.log_writer import FrameLogWriter
 from engram.sequences.opening import open_drive
 from engram.sequences.sequence import LoggedFrame, first_pair_hash, session_of
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from engram.errors import InputError, SequenceError
 from engram.geometry.se3 import SE3
-from engram.sequences.motion import Trajectory, read_tum, write_tum
+from engram.sequences.motion_files import Trajectory, read_tum, write_tum
 
 from .synthetic import only_engram_errors
 

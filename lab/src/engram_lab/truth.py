@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from engram.errors import InputError, SequenceError
 from engram.geometry.se3 import SE3
 from engram.sequences.listing import nanoseconds
-from engram.sequences.motion import (
+from engram.sequences.motion_files import (
     Trajectory,
     finite,
     known_stamp,

@@ -10,8 +10,8 @@ from tests.synthetic_world import World, drive
 from engram.graph.model import Clock
 from engram.robot.settings import RobotOptions
 from engram.sequences.framelog.file import FrameLogHeader
-from engram.sequences.framelog.writer import FrameLogWriter
-from engram.sequences.motion import Trajectory, write_tum
+from engram.sequences.framelog.log_writer import FrameLogWriter
+from engram.sequences.motion_files import Trajectory, write_tum
 from engram.sequences.sequence import LoggedFrame, SequenceInfo
 from engram_lab.studies.drives import DriveSet, drives_of
 from engram_lab.studies.running import RankingOptions

@@ -17,7 +17,7 @@ from engram.fleet.agent.agent import MAP
 from engram.fleet.agent.link import enrol
 from engram.fleet.centre.access import new_code
 from engram.fleet.centre.service import Centre, MapPolicy
-from engram.fleet.merge.settings import MergeOptions
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.monitor import QUIET

@@ -1,5 +1,5 @@
 """Calibrations of stereo pairs: formats of files, and what a drive makes of them."""
 
-from engram.calibration.cameras import Cameras
+from engram.calibration.calibrated_pair import Cameras
 
 __all__ = ["Cameras"]

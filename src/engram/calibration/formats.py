@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.calibration.cameras import (
+from engram.calibration.calibrated_pair import (
     MAX_CHARACTERS,
     Cameras,
     cameras_in_order,
@@ -154,7 +154,7 @@ def _size(entries: dict[str, Any], size: Callable[[], tuple[int, int]] | None) -
         if name in entries:
             width, height = numbers(entries, name, {2})
             return whole(width, name), whole(height, name)
-    names = [next((one for one in known if one in entries), None) for known in (_WIDTHS, _HEIGHTS)]
+    names = [next((key for key in known if key in entries), None) for known in (_WIDTHS, _HEIGHTS)]
     if all(names):
         return pixels(entries, str(names[0])), pixels(entries, str(names[1]))
     if size is None:
@@ -290,7 +290,7 @@ def cameras_of_infos(
             )
         )
     if rectified:
-        left, right = (_seen_through_p(one, stated=stated) for one in (left, right))
+        left, right = (_seen_through_p(info, stated=stated) for info in (left, right))
         _check_rows(left, right)
     ideal = left.is_ideal and right.is_ideal and _apart_px(left, right) <= _SAME_PX
     if baseline_m == 0 and right_from_left is not None:
@@ -448,7 +448,7 @@ def read_calibration(
         if is_camchain(entries):
             return parse_camchain(entries, field_of_view_deg)
         if is_camera_info(entries):
-            infos = [parse_camera_info(one) for one in (entries, _partner(path))]
+            infos = [parse_camera_info(side) for side in (entries, _partner(path))]
             return cameras_of_infos(
                 *infos, rectified=rectified, field_of_view_deg=field_of_view_deg
             )
@@ -474,4 +474,4 @@ def _partner(path: Path) -> dict[str, Any]:
 
 def _partner_path(path: Path) -> Path | None:
     names = (path.name.replace(*words) for words in _PARTNERS if words[0] in path.name)
-    return next((one for one in map(path.with_name, names) if one.is_file()), None)
+    return next((partner for partner in map(path.with_name, names) if partner.is_file()), None)

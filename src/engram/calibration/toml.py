@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from engram.calibration.cameras import Cameras, rectified_cameras
+from engram.calibration.calibrated_pair import Cameras, rectified_cameras
 from engram.config import load_toml
 from engram.errors import CalibrationError, ConfigError
 from engram.geometry.cameras import StereoCamera
@@ -130,7 +130,9 @@ def _raw_toml(raw: RawStereoCalibration, field_of_view_deg: float | None) -> str
         lines += ["", f"[raw.{side}]"]
         lines += [f"{name} = {float(getattr(lens, name))!r}" for name in ("fx", "fy", "cx", "cy")]
         lines.append(f'distortion = "{lens.distortion.value}"')
-        lines.append(f"coefficients = {[float(one) for one in lens.coefficients]!r}")
+        lines.append(
+            f"coefficients = {[float(coefficient) for coefficient in lens.coefficients]!r}"
+        )
     return "\n".join(lines) + "\n"
 
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from engram.calibration.cameras import Cameras
-    from engram.sequences.bags.sequence import BagFacts, BagSequence
+    from engram.calibration.calibrated_pair import Cameras
+    from engram.sequences.bags.bag_sequence import BagFacts, BagSequence
     from engram.sequences.layouts import ImageSequence
 
 
@@ -52,8 +52,8 @@ def info(
       engram drive info monday/ --left /front/left/image_raw
     """
     from engram.config import plain
+    from engram.sequences.bags.bag_sequence import describe_bag
     from engram.sequences.bags.containers import is_bag
-    from engram.sequences.bags.sequence import describe_bag
 
     if is_bag(path) and opening.format in {None, "bag"}:
         facts = describe_bag(path, opening.options())

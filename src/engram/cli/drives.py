@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from engram.calibration.cameras import Cameras
+    from engram.calibration.calibrated_pair import Cameras
     from engram.doctor.table import Diagnosis
     from engram.frontend.frame import StereoPair
     from engram.maps.map import Map
@@ -51,7 +51,7 @@ def losses_told(sequence: Drive) -> Iterator[None]:
 
 def _noted(sequence: Drive) -> None:
     """Says what of a drive's calibration was read otherwise than it is written."""
-    from engram.sequences.bags.sequence import BagSequence
+    from engram.sequences.bags.bag_sequence import BagSequence
     from engram.sequences.layouts import ImageSequence
 
     notes: Sequence[str] = ()
@@ -66,7 +66,7 @@ def _noted(sequence: Drive) -> None:
 def _told(sequence: Drive, heading: str) -> bool:
     """Says how images were paired, what was lost and left out; whether it was too much."""
     from engram.doctor.examination import DoctorConfig
-    from engram.sequences.bags.sequence import BagSequence
+    from engram.sequences.bags.bag_sequence import BagSequence
     from engram.sequences.framelog.reader import FrameLog
     from engram.sequences.opening import stamps_of
 

@@ -28,8 +28,8 @@ from engram.fleet.build.cluster import run_on_cluster
 from engram.fleet.build.orders import JudgeOptions, OrderResult, Orders
 from engram.fleet.download.updating import UpdateReport, update
 from engram.fleet.merge.gate import check_held_out
+from engram.fleet.merge.merge_settings import MergeOptions, SeedFrom, Unit
 from engram.fleet.merge.merging import merge
-from engram.fleet.merge.settings import MergeOptions, SeedFrom, Unit
 from engram.maps.map import Map
 from engram.maps.map_files import copy_map, publish_map
 from engram.measures import Drive, Estimator, route_not_localised
@@ -102,9 +102,9 @@ def try_all(
         monitor: receives progress per order, and may stop it.
     """
     if scheduler is None and workers == 1:
-        return all(try_orders(one, monitor) for one in asked.values())
+        return all(try_orders(task, monitor) for task in asked.values())
     ended: list[bool] = []
-    with monitor.stage("try orders", sum(one.count() for one in asked.values())) as stage:
+    with monitor.stage("try orders", sum(task.count() for task in asked.values())) as stage:
         if scheduler is not None:
             _on_cluster(asked, scheduler, stage, ended.append)
         else:
@@ -127,7 +127,7 @@ def _on_cluster(
     asked: Mapping[str, Try], scheduler: str, monitor: Monitor, ended: Callable[[bool], None]
 ) -> None:
     maps = _whole_maps(next(iter(asked.values())).handed)
-    tasks = {name: _FarTry(one, maps, _results_in(one.place)) for name, one in asked.items()}
+    tasks = {name: _FarTry(task, maps, _results_in(task.place)) for name, task in asked.items()}
 
     def done(name: str, made: tuple[bool, Mapping[str, bytes]]) -> None:
         end, results = made
@@ -161,7 +161,7 @@ def _whole_maps(paths: Sequence[Path]) -> list[bytes]:
 
 
 def _results_in(place: Path) -> dict[str, bytes]:
-    return {one.name: one.read_bytes() for one in sorted(place.glob("order-*.json"))}
+    return {path.name: path.read_bytes() for path in sorted(place.glob("order-*.json"))}
 
 
 def _write_results(place: Path, results: Mapping[str, bytes]) -> None:
@@ -201,24 +201,30 @@ def localised_in(
         for centre in maps
         for at, drive in enumerate(drives)
     }
-    found: dict[str, Drive] = {}
+    localised: dict[str, Drive] = {}
     with monitor.stage("judge", len(asked)) as stage:
         if workers == 1:
-            for name, one in asked.items():
+            for name, judgement in asked.items():
                 stage.check()
-                found[name] = _localised(one, stage)
+                localised[name] = _localised(judgement, stage)
         else:
             run_in_processes(
-                _localised, asked, workers, stage, lambda name, one, _: found.update({name: one})
+                _localised,
+                asked,
+                workers,
+                stage,
+                lambda name, drive, _: localised.update({name: drive}),
             )
-    every = [found[name] for name in asked]
+    every = [localised[name] for name in asked]
     return [every[at : at + len(drives)] for at in range(0, len(every), len(drives))]
 
 
-def _localised(one: _Judgement, monitor: Monitor) -> Drive:
-    with Map.open(one.centre) as store:
-        drive = measure(store, open_drive(one.drive), one.settings, one.localising)
-    monitor.advance(one.drive.stem)
+def _localised(judgement: _Judgement, monitor: Monitor) -> Drive:
+    with Map.open(judgement.centre) as store:
+        drive = measure(
+            store, open_drive(judgement.drive), judgement.settings, judgement.localising
+        )
+    monitor.advance(judgement.drive.stem)
     return drive
 
 
@@ -227,9 +233,12 @@ def gain(
 ) -> tuple[float, float, float]:
     """By how much less of the route is missed, and the ends of its interval, paired over drives."""
     missed_m = np.array(
-        [[float(one.step_m[~one.matched].sum()) for one in drives] for drives in (before, after)]
+        [
+            [float(drive.step_m[~drive.matched].sum()) for drive in drives]
+            for drives in (before, after)
+        ]
     )
-    driven_m = np.array([float(one.step_m.sum()) for one in before])
+    driven_m = np.array([float(localised.step_m.sum()) for localised in before])
     spared_m = missed_m[0] - missed_m[1]
     rng = np.random.default_rng(seed)
     count = len(driven_m)
@@ -320,7 +329,7 @@ class DreamReport:
         )
         if not count:
             return head
-        estimate, low, high = (100 * one for one in self.better_by)
+        estimate, low, high = (100 * share for share in self.better_by)
         lines = [
             head,
             f"best: {self.behaviour}, order {' '.join(map(str, self.order))}; route not localised "
@@ -368,9 +377,11 @@ def dream(
     folder = asked.folder()
     folder.mkdir(parents=True, exist_ok=True)
     report.complete = asked.try_behaviours(report, folder, monitor)
-    results = [(one.rank, name, one) for name, found in report.tried.items() for one in found]
+    results = [
+        (result.rank, name, result) for name, tried in report.tried.items() for result in tried
+    ]
     if results:
-        _, report.behaviour, best = min(results, key=lambda one: one[:2])
+        _, report.behaviour, best = min(results, key=lambda ranked: ranked[:2])
         report.order = best.order
         asked.add_best(report, monitor)
     if report.complete:
@@ -424,8 +435,8 @@ class _Dream:
         }
         complete = try_all(asked, options.workers, options.scheduler, monitor)
         for name, place in places.items():
-            if found := results_in(place):
-                report.tried[name] = found
+            if results := results_in(place):
+                report.tried[name] = results
         return complete
 
     def add_best(self, report: DreamReport, monitor: Monitor) -> None:

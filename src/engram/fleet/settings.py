@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from msgspec import Meta
 
 from engram.config import check_bounds
-from engram.fleet.merge.settings import MergeSettings
+from engram.fleet.merge.merge_settings import MergeSettings
 from engram.measures import Estimator
 
 if TYPE_CHECKING:

@@ -63,10 +63,10 @@ def weights() -> Mapping[str, NDArray[Any]]:
     Four (out, side, side, in) int8 layers of weights; the rest int32, (n,) factors and limits.
     """
     body = (resources.files("engram.frontend") / "data" / _FILE).read_bytes()
-    found = hashlib.sha256(body).hexdigest()[: len(MODEL)]
-    if found != MODEL:
+    digest = hashlib.sha256(body).hexdigest()[: len(MODEL)]
+    if digest != MODEL:
         raise IncompatibleError(
-            f"the installed weights {_FILE} are model {found}, must be {MODEL}; "
+            f"the installed weights {_FILE} are model {digest}, must be {MODEL}; "
             "install Engram again"
         )
     arrays: Mapping[str, NDArray[Any]] = load(body)
@@ -94,8 +94,8 @@ def beside_brief(
         octaves: (N,) uint8.
         brief: (N, 32) uint8, BRIEF-256 of the same points.
     """
-    found = network().describe(image, pixels, octaves)
-    return np.concatenate([found, brief[:, : BRIEF_BITS // 8]], axis=1)
+    descriptors = network().describe(image, pixels, octaves)
+    return np.concatenate([descriptors, brief[:, : BRIEF_BITS // 8]], axis=1)
 
 
 NET = DescriptorKind(f"net@{MODEL}")
@@ -230,9 +230,9 @@ def describe_brief(
     for octave in range(int(octaves.max(initial=0)) + 1):
         if octave:
             level = _core.halve(level)
-        here = octaves == octave
-        positions = np.rint((pixels[here] + 0.5) / 2**octave - 0.5).astype(np.int16)
-        descriptors[here] = _core.describe(_core.smooth(level), positions)
+        on_level = octaves == octave
+        positions = np.rint((pixels[on_level] + 0.5) / 2**octave - 0.5).astype(np.int16)
+        descriptors[on_level] = _core.describe(_core.smooth(level), positions)
     return descriptors
 
 
@@ -261,10 +261,10 @@ def describe_teblid(
 
 def detect_corners_with_net(pair: StereoPair, config: FrontendConfig, landmarks: int) -> Keypoints:
     """`detect_corners` and `describe_net`."""
-    found = detect_corners_with_brief(pair, config, landmarks)
-    assert found.descriptors is not None, "BRIEF comes with the corners"
-    described = beside_brief(pair.left, found.pixels, found.octaves, found.descriptors)
-    return replace(found, descriptors=described)
+    corners = detect_corners_with_brief(pair, config, landmarks)
+    assert corners.descriptors is not None, "BRIEF comes with the corners"
+    described = beside_brief(pair.left, corners.pixels, corners.octaves, corners.descriptors)
+    return replace(corners, descriptors=described)
 
 
 def describe_net(
@@ -313,13 +313,13 @@ def feature_kind(name: str) -> FeatureKind:
     if plain in added:
         kind = _PLUGINS.load(plain)
         FEATURES[kind.name] = kind
-    here = [kind for kind in FEATURES.values() if plain_name(kind.name) == plain]
-    if here and model in {"", here[0].name.partition("@")[2]}:
-        return here[0]
-    if here:
+    candidates = [kind for kind in FEATURES.values() if plain_name(kind.name) == plain]
+    if candidates and model in {"", candidates[0].name.partition("@")[2]}:
+        return candidates[0]
+    if candidates:
         raise IncompatibleError(
             f"descriptors of kind {plain} are of model {model or 'none'}, this installation has "
-            f"{here[0].name}: install the Engram that made them, or make them again from the "
+            f"{candidates[0].name}: install the Engram that made them, or make them again from the "
             f"images: engram record --features {plain}"
         )
     names = sorted({*map(plain_name, FEATURES), *added})
@@ -363,8 +363,8 @@ def fitted_matcher(
     suited = feature_kind(kind).matcher
     changes = {
         name: getattr(suited, name)
-        for name in (one.name for one in fields(matcher))
-        if any(getattr(matcher, name) == getattr(one, name) for one in untouched)
+        for name in (field.name for field in fields(matcher))
+        if any(getattr(matcher, name) == getattr(defaults, name) for defaults in untouched)
     }
     return replace(matcher, **changes)
 

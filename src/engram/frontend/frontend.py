@@ -36,24 +36,24 @@ def without_body(pair: StereoPair) -> StereoPair:
     return replace(pair, left=left)
 
 
-def clear_of_body(found: Keypoints, mask: NDArray[np.bool_]) -> Keypoints:
+def clear_of_body(corners: Keypoints, mask: NDArray[np.bool_]) -> Keypoints:
     """The corners that are clear of the body.
 
     Args:
         mask: (height, width) bool, False on the body.
     """
     clear_px = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
-    columns, rows = np.rint(found.pixels).astype(np.intp).T
+    columns, rows = np.rint(corners.pixels).astype(np.intp).T
     height, width = mask.shape
     at = clear_px[rows.clip(0, height - 1), columns.clip(0, width - 1)]
-    clear = at > _MARGIN_PX * 2.0**found.octaves
+    clear = at > _MARGIN_PX * 2.0**corners.octaves
     return replace(
-        found,
-        pixels=found.pixels[clear],
-        disparity_px=found.disparity_px[clear],
-        sigma_px=found.sigma_px[clear],
-        descriptors=None if found.descriptors is None else found.descriptors[clear],
-        octaves=found.octaves[clear],
+        corners,
+        pixels=corners.pixels[clear],
+        disparity_px=corners.disparity_px[clear],
+        sigma_px=corners.sigma_px[clear],
+        descriptors=None if corners.descriptors is None else corners.descriptors[clear],
+        octaves=corners.octaves[clear],
     )
 
 
@@ -152,26 +152,26 @@ class Frontend:
         check_pair(pair)
         pair, config = without_body(pair), self.config
         kind = feature_kind(config.descriptor)
-        found = kind.detect(pair, config, config.landmarks_for(pair.left.size))
+        keypoints = kind.detect(pair, config, config.landmarks_for(pair.left.size))
         if pair.mask is not None:
-            found = clear_of_body(found, pair.mask)
-        descriptors = found.descriptors
+            keypoints = clear_of_body(keypoints, pair.mask)
+        descriptors = keypoints.descriptors
         if descriptors is None:
-            descriptors = kind.describe(pair.left, found.pixels, found.octaves)
+            descriptors = kind.describe(pair.left, keypoints.pixels, keypoints.octaves)
         return Frame(
             stamp_ns=int(pair.stamp_ns),  # perhaps NumPy's: JSON knows none
             camera=pair.camera,
             landmarks=quantised_landmarks(
-                found.pixels,
-                found.disparity_px,
-                found.sigma_px,
+                keypoints.pixels,
+                keypoints.disparity_px,
+                keypoints.sigma_px,
                 descriptors,
-                found.octaves,
+                keypoints.octaves,
                 pair.camera,
             ),
             descriptor=config.descriptor,
             frontend=self.hash,
-            status=self._status(pair, len(found.pixels), found.candidates),
+            status=self._status(pair, len(keypoints.pixels), keypoints.candidates),
             thumbnail=make_thumbnail(pair.left) if config.thumbnails else None,
         )
 

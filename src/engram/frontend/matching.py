@@ -198,7 +198,7 @@ class Lanes:
 
     def match(self, live: Frame, questions: Sequence[Question]) -> list[Match]:
         """The match of each; see `match_frames`."""
-        asked = [_arguments(one, live) for one in questions]
+        asked = [_arguments(question, live) for question in questions]
         return [_match(found) for found in _core.attempt(features(live), asked, self._threads)]
 
     def close(self) -> None:

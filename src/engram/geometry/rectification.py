@@ -261,11 +261,13 @@ def _check_rectified(
     rotations: list[NDArray[np.float64]], projections: list[NDArray[np.float64]]
 ) -> None:
     """Refuses OpenCV's results for an impossible lens: infinities or a focal length of 0."""
-    finite = all(np.isfinite(one).all() for one in (*rotations, *projections))
-    if not (finite and all(one[0, 0] > 0 and one[1, 1] > 0 for one in projections)):
+    finite = all(np.isfinite(matrix).all() for matrix in (*rotations, *projections))
+    if not (
+        finite and all(projection[0, 0] > 0 and projection[1, 1] > 0 for projection in projections)
+    ):
         raise CalibrationError(
             "the stereo calibration leaves no usable image: it gives focal lengths of "
-            f"{', '.join(f'{one[0, 0]:.6g}' for one in projections)} px; check the "
+            f"{', '.join(f'{projection[0, 0]:.6g}' for projection in projections)} px; check the "
             "distortion coefficients"
         )
 

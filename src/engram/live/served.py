@@ -17,7 +17,7 @@ from typing import Any, Protocol, Self, TypeAlias
 import cv2
 import numpy as np
 
-from engram.calibration.cameras import Cameras
+from engram.calibration.calibrated_pair import Cameras
 from engram.calibration.formats import cameras_of_infos, parse_camera_info
 from engram.errors import CalibrationError, InputError
 from engram.frontend.frame import StereoPair

@@ -549,8 +549,8 @@ class FabMap:
         greatest = float(scores.max())
         # Terms below e^-40 of the greatest vanish in the rounding of the sum.
         near = scores[scores > greatest - 40.0]
-        here = self._prior_here + greatest + float(np.log(np.exp(near - greatest).sum()))
-        return float(np.logaddexp(here, self._prior_elsewhere + elsewhere))
+        known = self._prior_here + greatest + float(np.log(np.exp(near - greatest).sum()))
+        return float(np.logaddexp(known, self._prior_elsewhere + elsewhere))
 
 
 def _log_mean(logs: NDArray[np.float64]) -> float:

@@ -427,8 +427,8 @@ def one_word_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
     """A vocabulary by which all places look alike."""
     root_and_word = np.zeros((2, feature_kind(descriptor).descriptor_bytes), np.uint8)
     tree = TreeArrays(root_and_word, np.array([1, 2, 2], np.int32))
-    one, none = np.ones(1, np.int32), np.zeros(1, np.int32)
-    return Vocabulary(descriptor, tree, WordStatistics(2, one, none - 1, none), (), trained_on="–")
+    once, none = np.ones(1, np.int32), np.zeros(1, np.int32)
+    return Vocabulary(descriptor, tree, WordStatistics(2, once, none - 1, none), (), trained_on="–")
 
 
 def _metadata(body: bytes) -> _About:

@@ -170,8 +170,8 @@ class NodeWords:
 
         So equal nodes give equal bytes.
         """
-        found = {node: words for node in nodes if (words := self.of_node(node)) is not None}
-        other.put_words(self.hash, found)
+        kept = {node: words for node in nodes if (words := self.of_node(node)) is not None}
+        other.put_words(self.hash, kept)
 
     def frame_of(self, node: NodeId) -> Frame | None:
         """The frame of a node; None if its landmarks are damaged."""

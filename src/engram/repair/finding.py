@@ -328,9 +328,9 @@ class Crossings:
         on &= ~on.all(axis=0)
         best = 0
         for walk in self.walks:
-            here = on[:, walk]
-            sides = np.flatnonzero(here.any(axis=0))
-            second = here[1, sides]
+            on_walk = on[:, walk]
+            sides = np.flatnonzero(on_walk.any(axis=0))
+            second = on_walk[1, sides]
             changes = np.flatnonzero(second[1:] != second[:-1])
             for at in changes.tolist():
                 last, first = int(sides[at]), int(sides[at + 1])
@@ -395,52 +395,51 @@ class SecondLooks:
             list(self._surroundings.around(end, self._config.look_within_m, without=row))
             for end in (a, b)
         ]
-        return [self._look(one, other, pose) for one, other, pose in self._pairs(edge, *sides)]
+        return [self._look(near, other, pose) for near, other, pose in self._pairs(edge, *sides)]
 
     def _pairs(
         self, edge: Edge, side_a: Sequence[Near], side_b: Sequence[Near]
     ) -> list[tuple[Near, Near, SE3]]:
         """Pairs that should show the same things if the edge is right, spaced along the drives."""
         config = self._config
-        found: list[tuple[float, Near, Near, SE3]] = []
-        for one in side_a:
-            near_a = one.root_from_node.inverse() @ edge.a_from_b
-            for other in side_b:
-                apart = near_a @ other.root_from_node
+        pairs: list[tuple[float, Near, Near, SE3]] = []
+        for a in side_a:
+            node_from_b = a.root_from_node.inverse() @ edge.a_from_b
+            for b in side_b:
+                apart = node_from_b @ b.root_from_node
                 if apart.distance_m <= config.look_apart_m and apart.angle_rad <= config.look_rad:
-                    way_m = max(one.way_m, other.way_m)
-                    found.append((way_m, one, other, apart))
-        found.sort(key=lambda pair: (pair[0], pair[1].node, pair[2].node))
+                    pairs.append((max(a.way_m, b.way_m), a, b, apart))
+        pairs.sort(key=lambda pair: (pair[0], pair[1].node, pair[2].node))
         chosen: list[tuple[Near, Near, SE3]] = []
-        for _, one, other, apart in found:
+        for _, a, b, apart in pairs:
             if all(
-                _separate(one, kept[0], config.look_every_m)
-                or _separate(other, kept[1], config.look_every_m)
+                _separate(a, kept[0], config.look_every_m)
+                or _separate(b, kept[1], config.look_every_m)
                 for kept in chosen
             ):
-                chosen.append((one, other, apart))
+                chosen.append((a, b, apart))
             if len(chosen) == config.looks:
                 break
         return chosen
 
-    def _look(self, one: Near, other: Near, a_from_b: SE3) -> Look:
-        ids = [self._graph.node(near.node).id for near in (one, other)]
+    def _look(self, a: Near, b: Near, a_from_b: SE3) -> Look:
+        ids = [self._graph.node(near.node).id for near in (a, b)]
         try:
             reference, live = (self._frames.frame(node) for node in ids)
             matcher = feature_kind(live.descriptor).matcher
             match = match_frames(reference, live, matcher, pair_seed(ids[1], ids[0]))
         except MapCorruptError:
             match = Match(None, None, 0, *(np.empty(0, np.int32),) * 2)
-        way_m = max(one.way_m, other.way_m)
+        way_m = max(a.way_m, b.way_m)
         off_m = off_rad = float("inf")
         if match.reference_from_live is not None:
             off = a_from_b.inverse() @ match.reference_from_live
             off_m, off_rad = off.distance_m, off.angle_rad
-        return Look(one.node, other.node, way_m, a_from_b.distance_m, match.inliers, off_m, off_rad)
+        return Look(a.node, b.node, way_m, a_from_b.distance_m, match.inliers, off_m, off_rad)
 
 
-def _separate(one: Near, other: Near, every_m: float) -> bool:
-    return (one.root_from_node.inverse() @ other.root_from_node).distance_m >= every_m
+def _separate(near: Near, other: Near, every_m: float) -> bool:
+    return (near.root_from_node.inverse() @ other.root_from_node).distance_m >= every_m
 
 
 # Way from the ends of a wrong edge within which edges were predicted through it, metres.
@@ -546,13 +545,13 @@ def find_wrong_edges(
     gone: dict[int, Finding] = {}
     while True:
         search = _Search(graph, crossings, frames, config, gone)
-        found = search.findings(monitor)
-        alone = [one for one in found if one.surety >= 1 and one.why == "alone"]
+        findings = search.findings(monitor)
+        alone = [finding for finding in findings if finding.surety >= 1 and finding.why == "alone"]
         if not alone:
-            return search.report(found)
+            return search.report(findings)
         # In a single cycle any edge may be to blame: without the edges that nothing confirms
         # others may no longer be contradicted.
-        gone |= {one.row: one for one in alone}
+        gone |= {finding.row: finding for finding in alone}
 
 
 class _Search:
@@ -591,12 +590,12 @@ class _Search:
                 stage.check()
         return found
 
-    def report(self, found: Sequence[Finding]) -> Findings:
+    def report(self, findings: Sequence[Finding]) -> Findings:
         """Result of the rounds; `found` is of this, the last one."""
-        wrong = [*self._gone.values(), *(one for one in found if one.surety >= 1)]
+        wrong = [*self._gone.values(), *(finding for finding in findings if finding.surety >= 1)]
         wrong += self._derived(wrong)
-        doubtful = [one for one in found if self._config.doubtful <= one.surety < 1]
-        examined = len(self._gone) + len(found)
+        doubtful = [finding for finding in findings if self._config.doubtful <= finding.surety < 1]
+        examined = len(self._gone) + len(findings)
         return Findings(_ranked(wrong), _ranked(doubtful), examined, len(self._graph.edges))
 
     def _finding(self, row: int, looks: Sequence[Look]) -> Finding:
@@ -660,11 +659,11 @@ class _Search:
     def _derived(self, wrong: Sequence[Finding]) -> list[Finding]:
         """Predicted edges near wrong ones that assert the same."""
         graph, config = self._graph, self._config
-        found: dict[int, Finding] = {}
-        for one in wrong:
+        derived: dict[int, Finding] = {}
+        for finding in wrong:
             sides = [
                 {near.node: near.root_from_node for near in self._trusted.around(end, _BESIDE_M)}
-                for end in map(graph.index, (one.edge.a, one.edge.b))
+                for end in map(graph.index, (finding.edge.a, finding.edge.b))
             ]
             for node, a_from_node in sides[0].items():
                 for edge, row in graph.numbered_edges_of(node):
@@ -672,13 +671,13 @@ class _Search:
                     other = graph.index(edge.b if ahead else edge.a)
                     if edge.kind is not EdgeKind.PROXIMITY or other not in sides[1]:
                         continue
-                    said = a_from_node.inverse() @ one.edge.a_from_b @ sides[1][other]
+                    implied = a_from_node.inverse() @ finding.edge.a_from_b @ sides[1][other]
                     measured = edge.a_from_b if ahead else edge.a_from_b.inverse()
-                    apart_m = (measured.inverse() @ said).distance_m
+                    apart_m = (measured.inverse() @ implied).distance_m
                     off_m = float(self._suspicion.off_m[row])
                     if apart_m <= config.gross_m < off_m:
-                        found[row] = self._finding_of(row, "derived", surety=1.0)
-        return list(found.values())
+                        derived[row] = self._finding_of(row, "derived", surety=1.0)
+        return list(derived.values())
 
     def _finding_of(self, row: int, why: str, surety: float, **evidence: int) -> Finding:
         suspicion, edge = self._suspicion, self._graph.edges[row]
@@ -696,5 +695,7 @@ class _Search:
         )
 
 
-def _ranked(found: Sequence[Finding]) -> tuple[Finding, ...]:
-    return tuple(sorted(found, key=lambda one: (-one.surety, -one.off_m, one.row)))
+def _ranked(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    return tuple(
+        sorted(findings, key=lambda finding: (-finding.surety, -finding.off_m, finding.row))
+    )

@@ -30,33 +30,36 @@ from engram.viewing.pictures import match_picture
 _HEIGHT_PX = 360
 
 
-def write_pictures(frames: FrameReader, found: Findings, folder: Path) -> int:
+def write_pictures(frames: FrameReader, findings: Findings, folder: Path) -> int:
     """Writes one picture of each edge whose nodes have thumbnails; returns their number."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be created: {error.strerror}") from error
     written = 0
-    for number, one in enumerate((*found.wrong, *found.doubtful), start=1):
-        sides = [frames.thumbnail(node) for node in (one.edge.a, one.edge.b)]
+    for number, finding in enumerate((*findings.wrong, *findings.doubtful), start=1):
+        sides = [frames.thumbnail(node) for node in (finding.edge.a, finding.edge.b)]
         if sides[0] is None or sides[1] is None:
             continue
-        path = folder / f"{number:03d}_{one.why}_{str(one.edge.a)[:8]}_{str(one.edge.b)[:8]}.png"
-        if not cv2.imwrite(str(path), _picture(frames, one, sides[0], sides[1])):
+        path = (
+            folder
+            / f"{number:03d}_{finding.why}_{str(finding.edge.a)[:8]}_{str(finding.edge.b)[:8]}.png"
+        )
+        if not cv2.imwrite(str(path), _picture(frames, finding, sides[0], sides[1])):
             raise InputError(f"{path}: the picture cannot be written; is the disk full?")
         written += 1
     return written
 
 
 def _picture(
-    frames: FrameReader, one: Finding, a: NDArray[np.uint8], b: NDArray[np.uint8]
+    frames: FrameReader, finding: Finding, a: NDArray[np.uint8], b: NDArray[np.uint8]
 ) -> NDArray[np.uint8]:
     scale = _HEIGHT_PX / b.shape[0]
     enlarged = cv2.resize(b, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     size = (enlarged.shape[1], enlarged.shape[0])
-    pixels_a, pixels_b = _inliers(frames, one.edge.a, one.edge.b)
+    pixels_a, pixels_b = _inliers(frames, finding.edge.a, finding.edge.b)
     return match_picture(
-        a, enlarged.astype(np.uint8), pixels_a, (pixels_b * size).astype(np.float32), one.text()
+        a, enlarged.astype(np.uint8), pixels_a, (pixels_b * size).astype(np.float32), finding.text()
     )
 
 
@@ -101,12 +104,12 @@ class GeometryReport:
 
     def to_dict(self) -> dict[str, Any]:
         """What ``check --geometry --json`` prints."""
-        found = self.findings
+        findings = self.findings
         return {
-            "wrong": [one.to_dict() for one in found.wrong],
-            "doubtful": [one.to_dict() for one in found.doubtful],
-            "examined": found.examined,
-            "of_edges": found.of_edges,
+            "wrong": [finding.to_dict() for finding in findings.wrong],
+            "doubtful": [finding.to_dict() for finding in findings.doubtful],
+            "examined": findings.examined,
+            "of_edges": findings.of_edges,
             "components": {"without": self.components[0], "with": self.components[1]},
             "revision": self.revision,
             "moved": None if self.moved is None else self.moved.to_dict(),
@@ -115,16 +118,16 @@ class GeometryReport:
 
     def text(self) -> str:
         """In words."""
-        found, lines = self.findings, []
-        lines += [one.text() for one in found.wrong[:_SHOWN]]
-        if len(found.wrong) > _SHOWN:
-            lines.append(f"… and {len(found.wrong) - _SHOWN} more; --json lists all")
-        lines += [f"doubtful: {one.text()}" for one in found.doubtful[:_SHOWN]]
+        findings, lines = self.findings, []
+        lines += [finding.text() for finding in findings.wrong[:_SHOWN]]
+        if len(findings.wrong) > _SHOWN:
+            lines.append(f"… and {len(findings.wrong) - _SHOWN} more; --json lists all")
+        lines += [f"doubtful: {finding.text()}" for finding in findings.doubtful[:_SHOWN]]
         lines.append(
-            f"{len(found.wrong)} wrong and {len(found.doubtful)} doubtful of "
-            f"{counted(found.of_edges, 'edge')}, {found.examined} looked at twice"
+            f"{len(findings.wrong)} wrong and {len(findings.doubtful)} doubtful of "
+            f"{counted(findings.of_edges, 'edge')}, {findings.examined} looked at twice"
         )
-        if found.wrong and self.components[0] != self.components[1]:
+        if findings.wrong and self.components[0] != self.components[1]:
             parts = counted(self.components[0], "component")
             lines.append(f"without the wrong ones the map has {parts}, not {self.components[1]}")
         if self.revision is not None:
@@ -153,15 +156,15 @@ def check_geometry(
     """
     config = config or RepairConfig()
     with Map.open(path) as store:
-        found = find_wrong_edges(
+        findings = find_wrong_edges(
             store.graph, store.path_memory, store.frames, config, monitor=monitor
         )
-        written = 0 if pictures is None else write_pictures(store.frames, found, pictures)
-        components = _components(store, found)
-        if author is None or not found.wrong:
-            return GeometryReport(found, components, pictures=written)
-        revision, moved = remove_edges(store, found.wrong, config, author, placing)
-    return GeometryReport(found, components, revision, moved, written)
+        written = 0 if pictures is None else write_pictures(store.frames, findings, pictures)
+        components = _components(store, findings)
+        if author is None or not findings.wrong:
+            return GeometryReport(findings, components, pictures=written)
+        revision, moved = remove_edges(store, findings.wrong, config, author, placing)
+    return GeometryReport(findings, components, revision, moved, written)
 
 
 def remove_edges(
@@ -183,20 +186,20 @@ def remove_edges(
         with store.begin_revision(
             author=author, message=about, configuration={"repair": to_dict(config)}
         ) as writer:
-            for one in wrong:
-                edge = one.edge
+            for finding in wrong:
+                edge = finding.edge
                 writer.add_mark(
-                    Removal(edge.a, edge.b, edge.kind, edge.a_from_b, one.text(), now_ns)
+                    Removal(edge.a, edge.b, edge.kind, edge.a_from_b, finding.text(), now_ns)
                 )
             revision = writer.commit(placing)
         store.forget()
         return revision.number, moves(before, store.placements, goals)
 
 
-def _components(store: Map, found: Findings) -> tuple[int, int]:
+def _components(store: Map, findings: Findings) -> tuple[int, int]:
     graph = store.graph
     kept = np.ones(len(graph.edges), np.bool_)
-    kept[[one.row for one in found.wrong]] = False
+    kept[[finding.row for finding in findings.wrong]] = False
     every = (part_labels(graph.edge_ends[rows], len(graph)) for rows in (kept, slice(None)))
     without, whole = (len(np.unique(labels)) for labels in every)
     return without, whole

@@ -19,7 +19,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from engram.calibration.cameras import MAX_CHARACTERS, read_yaml
+from engram.calibration.calibrated_pair import MAX_CHARACTERS, read_yaml
 from engram.config import check_bounds
 from engram.counts import counted
 from engram.errors import ConfigError, InputError, MapCorruptError
@@ -38,9 +38,9 @@ from engram.maps.map_reader import MapReader
 from engram.monitor import QUIET, Monitor
 from engram.robot.localisers import DriveSequence, relocaliser_in
 from engram.robot.settings import Settings
+from engram.sequences.bags.bag_sequence import BagSequence
 from engram.sequences.bags.containers import is_bag
 from engram.sequences.bags.fixes import Fix, read_fixes
-from engram.sequences.bags.sequence import BagSequence
 from engram.sequences.images import image_size
 from engram.sequences.sequence import parse_time
 from engram.untrusted import read_text

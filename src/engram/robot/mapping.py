@@ -39,10 +39,10 @@ from engram.robot.robot import Robot
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import summarise
 from engram.sequences.framelog.file import FrameLogHeader
+from engram.sequences.framelog.log_writer import FrameLogWriter
 from engram.sequences.framelog.reader import FrameLog
-from engram.sequences.framelog.writer import FrameLogWriter
 from engram.sequences.layouts import ImageSequence
-from engram.sequences.motion import MovedSequence
+from engram.sequences.motion_files import MovedSequence
 from engram.sequences.opening import Drive, stamps_of
 from engram.sequences.sequence import LoggedFrame, SequenceInfo, first_pair_hash
 

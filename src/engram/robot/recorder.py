@@ -27,7 +27,7 @@ from engram.localiser.attempts import Outcome
 from engram.localiser.localisation import Localisation, LocalisationStatus
 from engram.robot.front import Arrived
 from engram.sequences.framelog.file import FrameLogHeader
-from engram.sequences.framelog.writer import FlightWriter
+from engram.sequences.framelog.log_writer import FlightWriter
 from engram.sequences.sequence import LoggedFrame, SequenceInfo, first_pair_hash
 
 # Frames that wait for the recorder's thread, 25 MB of images; beyond them it leaves frames out.

@@ -40,7 +40,7 @@ from engram.robot.live import LiveDrive, Saving
 from engram.robot.recorder import Recorder
 from engram.sequences.clocks import Placed
 from engram.sequences.framelog.reader import compose
-from engram.sequences.motion import MovedSequence
+from engram.sequences.motion_files import MovedSequence
 from engram.sequences.sequence import LoggedFrame
 
 # Frames whose positions `pose_at` remembers: ten seconds at 20 Hz.

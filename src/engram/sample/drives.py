@@ -16,7 +16,7 @@ from engram.files import draft_folder, naming
 from engram.maps.map import open_map
 from engram.monitor import QUIET, Monitor
 from engram.robot.starting import localise_drive
-from engram.sequences.motion import read_tum
+from engram.sequences.motion_files import read_tum
 from engram.sequences.opening import open_drive
 
 _DATA = Path(__file__).parent / "data"
@@ -45,7 +45,7 @@ DRIVES = (
 
 def write_drives(folder: Path, monitor: Monitor = QUIET) -> None:
     """Writes the drives into a folder, each as a whole or not at all; those that are there stay."""
-    shipped = {one.name: sorted(_files(_DATA / one.name)) for one in DRIVES}
+    shipped = {drive.name: sorted(_files(_DATA / drive.name)) for drive in DRIVES}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with monitor.stage("write drives", sum(map(len, shipped.values()))) as part:
@@ -62,7 +62,7 @@ def write_drives(folder: Path, monitor: Monitor = QUIET) -> None:
 def _write(target: Path, files: list[Path], monitor: Monitor) -> None:
     source = _DATA / target.name
     if target.exists():
-        if not all(_equal(source / one, target / one) for one in files):
+        if not all(_equal(source / file, target / file) for file in files):
             raise InputError(
                 f"{target} is there already, and is not the drive that Engram would write; remove "
                 "it, or choose another folder with --out"
@@ -79,11 +79,11 @@ def _write(target: Path, files: list[Path], monitor: Monitor) -> None:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    return (one.relative_to(folder) for one in folder.rglob("*") if one.is_file())
+    return (path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
 
 
-def _equal(one: Path, other: Path) -> bool:
-    return other.is_file() and filecmp.cmp(one, other, shallow=False)
+def _equal(file: Path, other: Path) -> bool:
+    return other.is_file() and filecmp.cmp(file, other, shallow=False)
 
 
 def _truth(name: str) -> str:
@@ -102,16 +102,16 @@ def offsets_m(map_path: Path, folder: Path) -> NDArray[np.float64]:
     """
     world_from_cam = {
         int(stamp_ns): pose
-        for one in DRIVES
-        for trajectory in [read_tum(folder / _truth(one.name))]
+        for drive in DRIVES
+        for trajectory in [read_tum(folder / _truth(drive.name))]
         for stamp_ns, pose in zip(trajectory.stamps_ns, trajectory.world_from_cam, strict=True)
     }
     with open_map(map_path) as opened:
-        found = localise_drive(opened, open_drive(folder / DRIVES[-1].name))
+        results = localise_drive(opened, open_drive(folder / DRIVES[-1].name))
     offsets = []
-    for one in found:
-        if one.node_from_live is None or one.node_stamp_ns not in world_from_cam:
+    for result in results:
+        if result.node_from_live is None or result.node_stamp_ns not in world_from_cam:
             continue
-        true = world_from_cam[one.node_stamp_ns].inverse() @ world_from_cam[one.stamp_ns]
-        offsets.append(np.linalg.norm(one.node_from_live.translation - true.translation))
+        true = world_from_cam[result.node_stamp_ns].inverse() @ world_from_cam[result.stamp_ns]
+        offsets.append(np.linalg.norm(result.node_from_live.translation - true.translation))
     return np.array(offsets, np.float64)

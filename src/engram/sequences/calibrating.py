@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.calibration.cameras import Cameras
+from engram.calibration.calibrated_pair import Cameras
 from engram.calibration.formats import read_calibration
 from engram.errors import CalibrationError, ConfigError, InputError
 from engram.frontend.features import match_sides
@@ -122,7 +122,7 @@ def check_sides(cameras: Cameras, pairs: Iterable[StereoPair], where: object) ->
     shifts: list[float] = []
     for pair in pairs:
         shifts += match_sides(pair).shift[:, 0].tolist()
-        shifts = [one for one in shifts if abs(one) > _NO_DISPARITY_PX]
+        shifts = [shift for shift in shifts if abs(shift) > _NO_DISPARITY_PX]
         if len(shifts) >= _ENOUGH:
             break
     if len(shifts) < _ENOUGH:

@@ -125,7 +125,7 @@ class StampReport:
                 f"{self.left_out} of {counted(self.count, what)} left out for the stamp ({facts}), "
                 f"such as {self.example}"
             )
-        return lines + [f"{what}s: {one.text()}" for one in self.steps]
+        return lines + [f"{what}s: {step.text()}" for step in self.steps]
 
 
 def joined(*reports: StampReport) -> StampReport:
@@ -136,11 +136,11 @@ def joined(*reports: StampReport) -> StampReport:
     """
     return StampReport(
         reports[0].count,
-        max(one.repeated for one in reports),
-        max(one.early for one in reports),
-        max(one.ahead for one in reports),
-        next((one.example for one in reports if one.example), ""),
-        next((one.steps for one in reports if one.steps), ()),
+        max(report.repeated for report in reports),
+        max(report.early for report in reports),
+        max(report.ahead for report in reports),
+        next((report.example for report in reports if report.example), ""),
+        next((report.steps for report in reports if report.steps), ()),
     )
 
 
@@ -243,7 +243,7 @@ class SteadyClock:
     @property
     def report(self) -> StampReport:
         """What happened to the stamps so far."""
-        repeated, early, ahead = (self._counts[one] for one in StampFault)
+        repeated, early, ahead = (self._counts[fault] for fault in StampFault)
         return StampReport(self._count, repeated, early, ahead, self._example, tuple(self.steps))
 
     def take(
@@ -282,7 +282,7 @@ class SteadyClock:
         near = partial(_follows, usual_ns=self._usual_ns(inf), far_ns=_LONE_NS)
         if all(near(a, b) for a, b in pairwise([last, *waiting])):
             return self._placed(waiting[:])
-        return self._placed([one for one in waiting if near(last, one)][:1])
+        return self._placed([stamp for stamp in waiting if near(last, stamp)][:1])
 
     def time_of(self, stamp_ns: int) -> int:
         """The time of a stamp: in the newest stretch that has it, else as after the newest step."""
@@ -295,7 +295,7 @@ class SteadyClock:
 
     def stamp_of(self, time_ns: int) -> int:
         """The stamp that has this time."""
-        at = bisect_right(self.steps, time_ns, key=lambda one: one.time_ns)
+        at = bisect_right(self.steps, time_ns, key=lambda step: step.time_ns)
         return time_ns - (self.steps[at - 1].shift_ns if at else 0)
 
     @property
@@ -390,7 +390,7 @@ class SteadyClock:
     def _placed(self, chain: list[_Stamp], step: ClockStep | None = None) -> list[Placed]:
         """Gives stamps their place; those that waited and are not among them are left out."""
         if self._waits:
-            self._drop([one for one in self._waiting if one not in chain], chain)
+            self._drop([waiting for waiting in self._waiting if waiting not in chain], chain)
         self._waiting.clear()
         placed = []
         for stamp in chain:
@@ -422,10 +422,10 @@ class SteadyClock:
                 self._drop([oldest], self._waiting)
 
     def _drop(self, stamps: Sequence[_Stamp], chain: Sequence[_Stamp]) -> None:
-        for one in stamps:
-            before = [two for two in chain if two.number < one.number]
-            after = next((two for two in chain if two.number > one.number), None)
-            self._count_fault(one, before[-1] if before else self._last or after)
+        for stamp in stamps:
+            before = [two for two in chain if two.number < stamp.number]
+            after = next((two for two in chain if two.number > stamp.number), None)
+            self._count_fault(stamp, before[-1] if before else self._last or after)
 
     def _count_fault(self, stamp: _Stamp, beside: _Stamp | None) -> None:
         """Counts a stamp that is left out, by its neighbour that has a place."""
@@ -455,8 +455,10 @@ def in_time(
     waiting: dict[int, T] = {}
 
     def ready(placed: Sequence[Placed]) -> Iterator[Timed[T]]:
-        for one in placed:
-            yield Timed(waiting[one.number], one.number, one.stamp_ns, one.time_ns, one.step)
+        for place in placed:
+            yield Timed(
+                waiting[place.number], place.number, place.stamp_ns, place.time_ns, place.step
+            )
         if placed:
             waiting.clear()
 

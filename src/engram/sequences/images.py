@@ -245,11 +245,11 @@ def _avif_size(content: bytes) -> tuple[int, int] | None:
 
 def _largest(content: bytes, mark: bytes, after: int) -> tuple[int, int] | None:
     """The largest width and height of those that stand behind a mark in the header."""
-    found, at = list[tuple[int, int]](), content.find(mark, 0, _HEADER_BYTES)
+    sizes, at = list[tuple[int, int]](), content.find(mark, 0, _HEADER_BYTES)
     while at >= 0:
-        found.append(struct.unpack_from(">II", content, at + after))
+        sizes.append(struct.unpack_from(">II", content, at + after))
         at = content.find(mark, at + 1, _HEADER_BYTES)
-    return max(found, key=lambda one: one[0] * one[1], default=None)
+    return max(sizes, key=lambda size: size[0] * size[1], default=None)
 
 
 def _sun_raster_size(content: bytes) -> tuple[int, int]:

@@ -32,7 +32,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.calibration.cameras import (
+from engram.calibration.calibrated_pair import (
     Cameras,
     entry,
     lens_of,
@@ -79,7 +79,7 @@ from engram.sequences.listing import (
     stamp_report,
     usable_pairs,
 )
-from engram.sequences.motion import motion_of_files, stamp_facts_of_files
+from engram.sequences.motion_files import motion_of_files, stamp_facts_of_files
 from engram.sequences.sequence import Channel, OpenOptions, Rig, SequenceInfo, parse_choice
 from engram.untrusted import printable, read_bytes, read_text
 
@@ -148,7 +148,7 @@ class ImageSequence:
     @property
     def skipped_reasons(self) -> list[str]:
         """Why each of the `skipped` pairs was left out."""
-        bad = (one for one in self._listing_faults if not isinstance(one, WrongStamp))
+        bad = (fault for fault in self._listing_faults if not isinstance(fault, WrongStamp))
         return [*bad, *self._reading_faults]
 
     @property
@@ -532,7 +532,7 @@ def _find(
     left, right = (list(_stamped_files(side)) for side in sides)
     tables = (sides[0] / "data.csv", sides[1] / "data.csv")
     places = pair_by_stamp(left, right, options.pair_tolerance_ns, tables)
-    first_ns = next((one.stamp_ns for one in left if isinstance(one, StampedFile)), 0)
+    first_ns = next((file.stamp_ns for file in left if isinstance(file, StampedFile)), 0)
     clock = Clock.UTC if first_ns >= YEAR_2000_NS else Clock.RELATIVE
     resolved = path.resolve()
     shown = resolved.parent.name if resolved.name == "mav0" else resolved.name
@@ -704,7 +704,7 @@ def _named_alike(left: Path, right: Path) -> list[dict[str, Path]]:
     if sides[0].keys() & sides[1].keys():
         return sides
     bare = [{_SIDE.sub("", name): file for name, file in side.items()} for side in sides]
-    whole = all(len(one) == len(other) for one, other in zip(bare, sides, strict=True))
+    whole = all(len(names) == len(other) for names, other in zip(bare, sides, strict=True))
     if whole and bare[0].keys() & bare[1].keys():
         return bare
     first = [next(iter(side.values())).name for side in sides]
@@ -721,7 +721,7 @@ def _numbered(names: set[str], stamps: int) -> dict[str, int]:
     sides, and those after them keep their lines.
     """
     ordered = sorted(names, key=_by_number)
-    if len(names) < stamps and all(one.isascii() and one.isdecimal() for one in names):
+    if len(names) < stamps and all(name.isascii() and name.isdecimal() for name in names):
         lines = {name: int(name) for name in ordered}
         if len(set(lines.values())) == len(names) and max(lines.values()) < stamps:
             return lines
@@ -730,7 +730,7 @@ def _numbered(names: set[str], stamps: int) -> dict[str, int]:
 
 def _by_number(name: str) -> tuple[list[str | int], str]:
     parts = re.split("([0-9]+)", name)  # every other one is a number
-    return [int(one) if at % 2 else one for at, one in enumerate(parts)], name
+    return [int(part) if at % 2 else part for at, part in enumerate(parts)], name
 
 
 def _named_by_stamp(folder: Path) -> list[StampedFile]:
@@ -815,7 +815,7 @@ def _cameras(path: Path, left: Path) -> Cameras:
         )
     tables = [_table(models / f"{name}_distortion_lut.bin", width, height) for name in _MODELS]
     fx, fy, cx, cy = values[0].tolist()
-    made_by = hashlib.sha256(b"".join(one.pixels.tobytes() for one in tables)).hexdigest()[:32]
+    made_by = hashlib.sha256(b"".join(table.pixels.tobytes() for table in tables)).hexdigest()[:32]
     camera = StereoCamera(fx, fy, cx, cy, _BASELINE_M, width, height, rectification=made_by)
     return Cameras(camera, Rectification(camera, SE3.identity(), tables[0], tables[1]))
 
@@ -835,7 +835,7 @@ def _intrinsics(path: Path) -> NDArray[np.float64]:
     """(4,) float64 fx, fy, cx, cy, px."""
     first = read_text(path, CalibrationError).split("\n", 1)[0].split()
     try:
-        values = np.array([float(one) for one in first[:4]])
+        values = np.array([float(text) for text in first[:4]])
     except ValueError as error:
         raise CalibrationError(f"{path}: line 1: {error}") from None
     if len(values) != 4 or not np.isfinite(values).all():

@@ -99,7 +99,7 @@ class _Pairing:
         return (set_apart or self._loose) and off_ns <= self._slack_ns
 
     def is_nearer(self, left: Timed[L], right: Timed[R], found: Timed[R]) -> bool:
-        off_ns, other_ns = (abs(left.stamp_ns - one.stamp_ns) for one in (right, found))
+        off_ns, other_ns = (abs(left.stamp_ns - candidate.stamp_ns) for candidate in (right, found))
         return off_ns <= self._tolerance_ns and off_ns < other_ns
 
     def learn(self, left: Timed[L], right: Timed[R]) -> None:
@@ -176,7 +176,7 @@ def stamp_report(places: Listing) -> StampReport:
         faults.count(StampFault.EARLY),
         faults.count(StampFault.AHEAD),
         next(iter(wrong), ""),
-        steps=tuple(one.step for one in places if isinstance(one, PairFiles) and one.step),
+        steps=tuple(place.step for place in places if isinstance(place, PairFiles) and place.step),
     )
 
 
@@ -266,7 +266,7 @@ def pair_by_number(
     """Listing of a layout in which line i of a file of stamps belongs to image i on both sides."""
     places: list[PairFiles | str] = []
     timed = _timed(stamps_ns, [f"line {at + 1}" for at in range(len(stamps_ns))], stamps_file)
-    for number, one in enumerate(timed):
+    for number, place in enumerate(timed):
         missing = [
             f"image {number} is missing in {next(iter(side.values())).parent}"
             for side in (left, right)
@@ -276,9 +276,9 @@ def pair_by_number(
             places.append(f"{'; '.join(missing)} ({stamps_file.name} has a stamp for it)")
         else:
             places.append(
-                PairFiles(one.time_ns, left[number], right[number], one.step)
-                if isinstance(one, Timed)
-                else one
+                PairFiles(place.time_ns, left[number], right[number], place.step)
+                if isinstance(place, Timed)
+                else place
             )
     for number in sorted(number for number in {*left, *right} if number >= len(stamps_ns)):
         extra = " and ".join(str(side[number]) for side in (left, right) if number in side)
@@ -305,35 +305,37 @@ def pair_by_stamp(
     lefts, rights = _timed_files(left, sources[0]), _timed_files(right, sources[1])
     partners: dict[int, Timed[StampedFile]] = {}
     alone: list[Timed[StampedFile]] = []
-    sides = [iter([one for one in side if isinstance(one, Timed)]) for side in (lefts, rights)]
-    for one, other in paired(sides[0], sides[1], tolerance_ns):
-        if one is not None and other is not None:
-            partners[one.number] = other
-        elif other is not None:
-            alone.append(other)
-    wrong = [one for one in rights if isinstance(one, WrongStamp)]
+    sides = [iter([item for item in side if isinstance(item, Timed)]) for side in (lefts, rights)]
+    for own, partner in paired(sides[0], sides[1], tolerance_ns):
+        if own is not None and partner is not None:
+            partners[own.number] = partner
+        elif partner is not None:
+            alone.append(partner)
+    wrong = [right for right in rights if isinstance(right, WrongStamp)]
     within = f"within {tolerance_ns / 1e6:g} ms"
     places: list[PairFiles | str] = []
     for item in lefts:
         if isinstance(item, str):
             places.append(item)
-        elif (partner := partners.get(item.number)) is not None:
-            places.append(_pair(item, partner))
+        elif (match := partners.get(item.number)) is not None:
+            places.append(_pair(item, match))
         elif wrong:  # that of its partner
             places.append(wrong.pop(0))
         else:
             off = _nearest_text(item.stamp_ns, rights)
             places.append(f"{item.item.path}: no right image {within} ({off})")
     # What is wrong on both sides, or has no partner for that, is one fault.
-    told = sum(isinstance(one, WrongStamp) for one in lefts)
-    places += [one for one in rights if isinstance(one, str) and not isinstance(one, WrongStamp)]
-    places += wrong[told:]
-    places += [f"{one.item.path}: no left image {within}" for one in alone[told:]]
+    named = sum(isinstance(left, WrongStamp) for left in lefts)
+    places += [
+        right for right in rights if isinstance(right, str) and not isinstance(right, WrongStamp)
+    ]
+    places += wrong[named:]
+    places += [f"{right.item.path}: no left image {within}" for right in alone[named:]]
     return places
 
 
 def _pair(left: Timed[StampedFile], right: Timed[StampedFile]) -> PairFiles | str:
-    faults = [one.item.fault for one in (left, right) if one.item.fault]
+    faults = [side.item.fault for side in (left, right) if side.item.fault]
     step = left.step or right.step
     return "; ".join(faults) or PairFiles(left.time_ns, left.item.path, right.item.path, step)
 
@@ -347,7 +349,7 @@ def usable_pairs(
     """
     chosen = choose(places)
     reasons = [place for place in chosen if isinstance(place, str)]
-    bad = [one for one in reasons if not isinstance(one, WrongStamp)]
+    bad = [reason for reason in reasons if not isinstance(reason, WrongStamp)]
     pairs = [place for place in chosen if isinstance(place, PairFiles)]
     if bad and pairs and not skip_bad:
         more = f" (and {len(bad) - 1} more such faults)" if len(bad) > 1 else ""
@@ -374,34 +376,36 @@ def _timed_files(
     files = [item for item in listed if isinstance(item, StampedFile)]
     names = [f"image {file.path.name}" for file in files]
     timed = iter(_timed([file.stamp_ns for file in files], names, source))
-    found: list[Timed[StampedFile] | str] = []
+    files_in_time: list[Timed[StampedFile] | str] = []
     for item in listed:
         if isinstance(item, str):
-            found.append(item)
+            files_in_time.append(item)
             continue
-        one = next(timed)
-        if isinstance(one, Timed):
-            found.append(Timed(item, one.number, one.stamp_ns, one.time_ns, one.step))
+        placed = next(timed)
+        if isinstance(placed, Timed):
+            files_in_time.append(
+                Timed(item, placed.number, placed.stamp_ns, placed.time_ns, placed.step)
+            )
         else:
-            found.append(one)
-    return found
+            files_in_time.append(placed)
+    return files_in_time
 
 
 def _nearest_text(stamp_ns: int, others: Iterable[Timed[StampedFile] | str]) -> str:
-    off_ns = [abs(one.stamp_ns - stamp_ns) for one in others if isinstance(one, Timed)]
+    off_ns = [abs(other.stamp_ns - stamp_ns) for other in others if isinstance(other, Timed)]
     return f"the nearest is {min(off_ns) / 1e6:.3f} ms off" if off_ns else "there is none"
 
 
 def _timed(
     stamps_ns: Sequence[int], names: Sequence[str], source: Path
 ) -> list[Timed[int] | WrongStamp]:
-    found: list[Timed[int] | WrongStamp | None] = [None] * len(stamps_ns)
+    times: list[Timed[int] | WrongStamp | None] = [None] * len(stamps_ns)
 
     def left_out(number: int, fault: StampFault) -> None:
         text = f"{source}: {names[number]} ({stamps_ns[number]} ns) {fault}"
-        found[number] = WrongStamp(text, fault)
+        times[number] = WrongStamp(text, fault)
 
     clock = SteadyClock(waits=True, left_out=left_out)
-    for one in in_time(stamps_ns, lambda stamp_ns: stamp_ns, clock):
-        found[one.number] = one
-    return [one for one in found if one is not None]
+    for item in in_time(stamps_ns, lambda stamp_ns: stamp_ns, clock):
+        times[item.number] = item
+    return [item for item in times if item is not None]

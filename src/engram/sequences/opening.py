@@ -18,8 +18,8 @@ from engram.errors import ConfigError, SequenceError
 from engram.files import check_there
 from engram.keywords import keywords
 from engram.plugins import PluginGroup, check_is
+from engram.sequences.bags.bag_sequence import BagSequence, open_bag
 from engram.sequences.bags.containers import is_bag
-from engram.sequences.bags.sequence import BagSequence, open_bag
 from engram.sequences.clocks import StampReport
 from engram.sequences.framelog.reader import FrameLog, is_framelog, open_framelog
 from engram.sequences.images import IMAGE_SUFFIXES
@@ -265,7 +265,7 @@ def layout_named(name: str) -> SequenceFormat:
 
 
 _PLUGINS = PluginGroup(
-    "engram.readers", "reader of drives", lambda _, found: check_is(found, SequenceFormat)
+    "engram.readers", "reader of drives", lambda _, value: check_is(value, SequenceFormat)
 )
 
 
@@ -278,14 +278,16 @@ def recognise(path: Path) -> str:
     if path.suffix == ".engram":
         raise SequenceError(f"{path}: is the name of a map, not of a drive; the map is given first")
     check_there(path, SequenceError)
-    found = [name for name, layout in _layouts().items() if layout.recognises(path)]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise SequenceError(f"{path}: could be {' or '.join(found)}: name the layout with --format")
+    layouts = [name for name, layout in _layouts().items() if layout.recognises(path)]
+    if len(layouts) == 1:
+        return layouts[0]
+    if layouts:
+        raise SequenceError(
+            f"{path}: could be {' or '.join(layouts)}: name the layout with --format"
+        )
     inside = drives_inside(path)
     if inside:
-        named = "\n".join(f"  {one}" for one in inside[:_MOST_NAMED])
+        named = "\n".join(f"  {drive}" for drive in inside[:_MOST_NAMED])
         more = f"\n  and {len(inside) - _MOST_NAMED} more" if len(inside) > _MOST_NAMED else ""
         raise SequenceError(f"{path}: is not a drive but holds some; name one of\n{named}{more}")
     raise SequenceError(
@@ -306,7 +308,7 @@ def _asked_of(path: Path) -> str | None:
             f"those of the other into {folder}/right. Then write times.txt there (one line per "
             f"pair, seconds) and calibration.toml. {_TEMPLATE_OF}"
         )
-    images = next((one for one in (path, *_entries(path)) if _has_images(one)), None)
+    images = next((folder for folder in (path, *_entries(path)) if _has_images(folder)), None)
     if images is None:
         return None
     return (
@@ -318,7 +320,7 @@ def _asked_of(path: Path) -> str | None:
 
 
 def _has_images(folder: Path) -> bool:
-    return any(one.suffix.lower() in IMAGE_SUFFIXES for one in _entries(folder))
+    return any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in _entries(folder))
 
 
 def drives_inside(path: Path) -> list[Path]:
@@ -331,13 +333,13 @@ def drives_inside(path: Path) -> list[Path]:
     def is_drive(path: Path) -> bool:
         return any(layout.recognises(path) for layout in layouts)
 
-    found: list[Path] = []
+    drives: list[Path] = []
     for child in _entries(path):
         if is_drive(child):
-            found.append(child)
+            drives.append(child)
         elif not child.name.startswith("."):
-            found += filter(is_drive, _entries(child))
-    return found
+            drives += filter(is_drive, _entries(child))
+    return drives
 
 
 def _entries(folder: Path) -> list[Path]:

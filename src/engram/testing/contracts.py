@@ -68,7 +68,7 @@ class Check:
 
 def unmet(checks: Iterable[Check]) -> list[str]:
     """The unmet demands, each with what was found; a test asserts that the list is empty."""
-    return [f"{one.demand}: {one.found}" for one in checks if not one.met]
+    return [f"{check.demand}: {check.found}" for check in checks if not check.met]
 
 
 _WALL_CAMERA = StereoCamera(260.0, 260.0, 160.0, 120.0, 0.2, 320, 240)
@@ -308,7 +308,7 @@ def make_context(
         on_paths = (node for path in paths for node in path)
         used = [*candidates, *observed, *on_paths, *attempted, reference or 0]
         graph = flat_graph(max(used, default=0) + 1, sessions)
-    records = [session_record(number, one) for number, one in enumerate(hours or [])]
+    records = [session_record(number, hour) for number, hour in enumerate(hours or [])]
     return RankingContext(
         neighbourhood=neighbourhood_of(candidates, along),
         graph=graph,
@@ -425,8 +425,8 @@ _Fault = Callable[[RankingContext], str]
 
 
 def _checked_policy(demand: str, contexts: Iterable[RankingContext], fault: _Fault) -> Check:
-    found = ((number, fault(one)) for number, one in enumerate(contexts))
-    number, first = next(((number, text) for number, text in found if text), (0, ""))
+    faults = ((number, fault(context)) for number, context in enumerate(contexts))
+    number, first = next(((number, text) for number, text in faults if text), (0, ""))
     return Check(demand, not first, f"{first} in situation {number}" if first else "yes")
 
 
@@ -487,8 +487,8 @@ def _without_own_path(make: Callable[[], RankingPolicy]) -> _Fault:
     return lambda context: _difference(make().rank(context), make().rank(with_own))
 
 
-def _difference(one: NDArray[np.signedinteger], other: NDArray[np.signedinteger]) -> str:
-    return "" if np.array_equal(one, other) else f"{one.tolist()}, then {other.tolist()}"
+def _difference(first: NDArray[np.signedinteger], other: NDArray[np.signedinteger]) -> str:
+    return "" if np.array_equal(first, other) else f"{first.tolist()}, then {other.tolist()}"
 
 
 # Writes a drive of these pairs below an empty folder and returns the path that users name.
@@ -571,8 +571,8 @@ class _Trial:
         if not self._layout.recognises(self._drive):
             return f"{self._drive.name} is not recognised"
         others = [name for name in layout_names() if name != self._name]
-        found = [name for name in others if layout_named(name).recognises(self._drive)]
-        return f"also recognised as {', '.join(found)}" if found else ""
+        claimants = [name for name in others if layout_named(name).recognises(self._drive)]
+        return f"also recognised as {', '.join(claimants)}" if claimants else ""
 
     def _others(self) -> str:
         empty, note = self._folder / "empty", self._folder / "note.txt"
@@ -608,9 +608,9 @@ class _Trial:
         return ""
 
     def _camera(self) -> str:
-        found = self._open(self._drive).camera
+        camera = self._open(self._drive).camera
         for name in ("fx", "fy", "baseline_m") if self._writes_camera else ():
-            wanted, value = getattr(_DRIVE_CAMERA, name), getattr(found, name)
+            wanted, value = getattr(_DRIVE_CAMERA, name), getattr(camera, name)
             if abs(value - wanted) > _SAME_CAMERA * wanted:
                 return f"{name} is {value:g}, must be {wanted:g}"
         return ""
@@ -655,7 +655,7 @@ class _Trial:
 
     @staticmethod
     def _image_files(path: Path) -> list[Path]:
-        return sorted(one for one in path.rglob("*") if one.suffix.lower() in IMAGE_SUFFIXES)
+        return sorted(file for file in path.rglob("*") if file.suffix.lower() in IMAGE_SUFFIXES)
 
 
 def _checked_drive(demand: str, fault: Callable[[], str]) -> Check:
@@ -667,12 +667,12 @@ def _checked_drive(demand: str, fault: Callable[[], str]) -> Check:
 
 
 def _stamps_of(drive: Drive) -> NDArray[np.int64]:
-    frames = (one.frame if isinstance(one, LoggedFrame) else one for one in drive)
-    return np.array([one.stamp_ns for one in frames], np.int64)
+    frames = (item.frame if isinstance(item, LoggedFrame) else item for item in drive)
+    return np.array([frame.stamp_ns for frame in frames], np.int64)
 
 
 def _pairs_of(drive: Drive) -> list[StereoPair]:
-    return [one for one in drive if isinstance(one, StereoPair)]
+    return [pair for pair in drive if isinstance(pair, StereoPair)]
 
 
 def _not_these(stamps_ns: NDArray[np.int64], wanted: Sequence[int], first: int = 0) -> str:
@@ -685,10 +685,10 @@ def _not_these(stamps_ns: NDArray[np.int64], wanted: Sequence[int], first: int =
     return "" if off_ns[worst] <= _SAME_STAMP_NS else f"pair {worst} is {off_ns[worst]} ns off"
 
 
-def _likeness(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
+def _likeness(image: NDArray[np.uint8], other: NDArray[np.uint8]) -> float:
     """Correlation of the middle halves of two (h, w) images."""
-    rows, columns = (slice(size // 4, -size // 4) for size in one.shape)
-    return float(np.corrcoef(one[rows, columns].ravel(), other[rows, columns].ravel())[0, 1])
+    rows, columns = (slice(size // 4, -size // 4) for size in image.shape)
+    return float(np.corrcoef(image[rows, columns].ravel(), other[rows, columns].ravel())[0, 1])
 
 
 def _drive_pair(index: int) -> StereoPair:

@@ -113,9 +113,9 @@ def match_picture(
     canvas[shift[1] :, shift[0] :] = live_image[..., None]
     ends = np.round(live_pixels).astype(int) + shift
     starts = np.round(node_pixels * (width, height)).astype(int)
-    for one in _spread(live_pixels):
-        colour = _colour(float(live_pixels[one, 1]) / height)
-        cv2.line(canvas, tuple(starts[one]), tuple(ends[one]), colour, 1, cv2.LINE_AA)
+    for row in _spread(live_pixels):
+        colour = _colour(float(live_pixels[row, 1]) / height)
+        cv2.line(canvas, tuple(starts[row]), tuple(ends[row]), colour, 1, cv2.LINE_AA)
     for start, end, live in zip(starts, ends, live_pixels, strict=True):
         colour = _colour(float(live[1]) / height)
         for centre in (start, end):
@@ -140,7 +140,7 @@ def _spread(pixels: NDArray[np.float32]) -> list[int]:
 
 
 def _write_name(canvas: Image, name: str, corner: NDArray[np.int_]) -> None:
-    x, y = (int(one) for one in corner)
+    x, y = (int(value) for value in corner)
     cv2.rectangle(canvas, (x, y), (x + 46, y + 20), (0, 0, 0), -1)
     _write(canvas, name, (x + 5, y + 15))
 
@@ -173,7 +173,7 @@ class PictureWriter:
         except OSError as error:
             raise InputError(f"{folder}: cannot be created: {error.strerror}") from error
 
-    def offer(self, seen: Seen, found: Localisation) -> None:
+    def offer(self, seen: Seen, localisation: Localisation) -> None:
         """Writes a picture of the frame just localised, if it is due.
 
         Args:
@@ -185,8 +185,8 @@ class PictureWriter:
         image = seen.arrived.left if isinstance(seen.arrived, StereoPair) else seen.frame.thumbnail
         if image is None:
             return
-        success = outcome_at(seen.outcomes, found.node)
-        status = found.status.value
+        success = outcome_at(seen.outcomes, localisation.node)
+        status = localisation.status.value
         if success is None:
             nothing = np.zeros((0, 2), dtype=np.float32)
             picture = match_picture(np.zeros_like(image), image, nothing, nothing, status)
@@ -275,12 +275,12 @@ def row_offsets_px(pair: StereoPair) -> NDArray[np.float64]:
         return np.zeros(0)
     matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(left_codes, right_codes)
     offsets = [
-        left[one.queryIdx].pt[1] - right[one.trainIdx].pt[1]
-        for one in matches
-        if one.distance <= _MOST_BITS
+        left[match.queryIdx].pt[1] - right[match.trainIdx].pt[1]
+        for match in matches
+        if match.distance <= _MOST_BITS
     ]
-    found = np.array(offsets, dtype=np.float64)
-    return found[np.abs(found) <= _MOST_ROWS_PX]
+    offsets_m = np.array(offsets, dtype=np.float64)
+    return offsets_m[np.abs(offsets_m) <= _MOST_ROWS_PX]
 
 
 def rectified_picture(pair: StereoPair, caption: str) -> NDArray[np.uint8]:
@@ -293,7 +293,7 @@ def rectified_picture(pair: StereoPair, caption: str) -> NDArray[np.uint8]:
     for number in range(1, _EPIPOLAR_LINES):
         row = number * height // _EPIPOLAR_LINES
         hue = np.array([[[170 * number // _EPIPOLAR_LINES, 200, 255]]], dtype=np.uint8)
-        colour = tuple(int(one) for one in cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0])
+        colour = tuple(int(value) for value in cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0])
         cv2.line(canvas, (0, row), (2 * width + _PAIR_GAP_PX, row), colour, 1)
     for text, column in ((f"left   {caption}", 6), ("right", width + _PAIR_GAP_PX + 6)):
         origin = (column, height + _PAIR_CAPTION_PX - 8)

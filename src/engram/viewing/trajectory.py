@@ -16,7 +16,7 @@ from engram.geometry.se3 import SE3
 from engram.graph.graph import ChainTree, ExperienceGraph
 from engram.graph.model import NodeId
 from engram.localiser.localisation import Localisation
-from engram.sequences.motion import Trajectory, write_tum
+from engram.sequences.motion_files import Trajectory, write_tum
 
 HEADER = (
     "timestamp x y z qx qy qz qw; seconds, metres; frame: camera of the first localised node",
@@ -36,21 +36,21 @@ def chain_trajectory(
         (stamp_ns, first_from_live) of each placed frame, in temporal order.
     """
     placed = _PlacedNodes(graph)
-    withdrawn = {stamp_ns for found in results for stamp_ns in found.withdraws}
+    withdrawn = {stamp_ns for result in results for stamp_ns in result.withdraws}
     trajectory: list[tuple[int, SE3]] = []
     first_from_live: SE3 | None = None
-    for found in results:
-        stands = found.stamp_ns not in withdrawn
-        if stands and found.node is not None and found.node_from_live is not None:
-            first_from_node = placed.place(found.node, first_from_live, found.node_from_live)
+    for result in results:
+        stands = result.stamp_ns not in withdrawn
+        if stands and result.node is not None and result.node_from_live is not None:
+            first_from_node = placed.place(result.node, first_from_live, result.node_from_live)
             first_from_live = (
-                None if first_from_node is None else first_from_node @ found.node_from_live
+                None if first_from_node is None else first_from_node @ result.node_from_live
             )
         elif first_from_live is not None:
-            moved = found.motion.odometry.prev_from_curr
+            moved = result.motion.odometry.prev_from_curr
             first_from_live = None if moved is None else first_from_live @ moved
         if first_from_live is not None:
-            trajectory.append((found.stamp_ns, first_from_live))
+            trajectory.append((result.stamp_ns, first_from_live))
     return trajectory
 
 

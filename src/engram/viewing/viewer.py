@@ -88,54 +88,55 @@ class Viewer:
         self._stream.log("map/nodes", points, static=True)
         goals = {name: opened.frame.locate(goal) for name, goal in opened.goals.items()}
         stars = self._rr.Points3D(
-            np.array([(one.x_m, one.y_m, one.z_m) for one in goals.values()]).reshape(-1, 3),
+            np.array([(goal.x_m, goal.y_m, goal.z_m) for goal in goals.values()]).reshape(-1, 3),
             labels=[printable(name) for name in goals],
             radii=0.5,
         )
         self._stream.log("map/goals", stars, static=True)
 
-    def see(self, seen: Seen, found: Localisation) -> None:
+    def see(self, seen: Seen, localisation: Localisation) -> None:
         """Shows a frame, its inliers, the candidates, and how sure the robot is.
 
         Args:
             seen: `Robot.last`.
         """
         stream, rr = self._stream, self._rr
-        stream.set_time("stamp", timestamp=np.datetime64(found.stamp_ns, "ns"))
+        stream.set_time("stamp", timestamp=np.datetime64(localisation.stamp_ns, "ns"))
         if isinstance(seen.arrived, StereoPair):
             image = rr.Image(seen.arrived.left).compress(jpeg_quality=_JPEG_QUALITY)
             stream.log("live/image", image)
-        colour = _STATUS_COLOURS.get(found.status, _GREY)
-        pixels, best = seen.frame.landmarks.pixels, outcome_at(seen.outcomes, found.node)
+        colour = _STATUS_COLOURS.get(localisation.status, _GREY)
+        pixels, best = seen.frame.landmarks.pixels, outcome_at(seen.outcomes, localisation.node)
         stream.log("live/image/landmarks", rr.Points2D(pixels, colors=_GREY, radii=1.0))
         inliers = pixels[:0] if best is None else pixels[best.match.live_rows]
         stream.log("live/image/inliers", rr.Points2D(inliers, colors=colour, radii=2.0))
-        stream.log("status", rr.TextLog(found.status.value, color=colour))
-        stream.log("confidence", rr.Scalars(max(found.confidence, -20.0)))
-        stream.log("inliers", rr.Scalars(found.inliers))
+        stream.log("status", rr.TextLog(localisation.status.value, color=colour))
+        stream.log("confidence", rr.Scalars(max(localisation.confidence, -20.0)))
+        stream.log("inliers", rr.Scalars(localisation.inliers))
         self._show_candidates(seen)
-        self._show_place(found, colour)
+        self._show_place(localisation, colour)
 
     def _show_candidates(self, seen: Seen) -> None:
         right, wrong = (
-            _STATUS_COLOURS[one] for one in (LocalisationStatus.LOCALISED, LocalisationStatus.LOST)
+            _STATUS_COLOURS[status]
+            for status in (LocalisationStatus.LOCALISED, LocalisationStatus.LOST)
         )
         places, colours = [], []
-        for one in seen.outcomes:
-            map_from_node = self._whereabouts and self._whereabouts.of(one.candidate.node)
+        for outcome in seen.outcomes:
+            map_from_node = self._whereabouts and self._whereabouts.of(outcome.candidate.node)
             if map_from_node:
                 places.append(map_from_node.translation)
-                colours.append(right if one.accepted else wrong)
+                colours.append(right if outcome.accepted else wrong)
         points = self._rr.Points3D(np.reshape(places, (-1, 3)), colors=colours, radii=0.6)
         self._stream.log("map/tried", points)
 
-    def _show_place(self, found: Localisation, colour: tuple[int, int, int]) -> None:
-        map_from_live = self._whereabouts and self._whereabouts.after(found)
+    def _show_place(self, localisation: Localisation, colour: tuple[int, int, int]) -> None:
+        map_from_live = self._whereabouts and self._whereabouts.after(localisation)
         if not map_from_live:
             return
-        here = map_from_live.translation
-        self._stream.log("map/robot", self._rr.Points3D([here], colors=colour, radii=0.8))
-        self._driven.append(here)
+        position_m = map_from_live.translation
+        self._stream.log("map/robot", self._rr.Points3D([position_m], colors=colour, radii=0.8))
+        self._driven.append(position_m)
         part = (len(self._driven) - 1) // _STRIP
         strip = self._rr.LineStrips3D([self._driven[max(part * _STRIP - 1, 0) :]], colors=_GREY)
         self._stream.log(f"map/driven/{part}", strip)

@@ -38,8 +38,8 @@ from engram.fleet.centre.access import new_code
 from engram.fleet.centre.database import first_broken
 from engram.fleet.centre.service import Centre
 from engram.fleet.centre.serving import Listening, run_worker, serve
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.fleet.merge.merging import merge
-from engram.fleet.merge.settings import MergeOptions
 from engram.maps.map import Map
 from engram.maps.map_files import check_file, copy_map
 from engram.processes import end_with_parent

@@ -34,7 +34,7 @@ from engram.fleet.agent.agent import Agent
 from engram.fleet.agent.link import enrol, new_client
 from engram.fleet.centre.access import new_code
 from engram.fleet.centre.service import Centre, MapPolicy
-from engram.fleet.merge.settings import MergeOptions
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.maps.map import open_map
 from engram_lab.checks.merge_scaling import SESSION_NODES, write_map, write_session
 from engram_lab.programs import Figure, command_line, report

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.calibration.cameras import Cameras
+from engram.calibration.calibrated_pair import Cameras
 from engram.geometry.se3 import SE3
 from engram.maps.map import open_map
 from engram.monitor import QUIET

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.calibration.cameras import Cameras
+from engram.calibration.calibrated_pair import Cameras
 from engram.calibration.toml import calibration_toml
 from engram.frontend.frame import StereoPair
 from engram.maps.map import open_map

@@ -39,9 +39,9 @@ import numpy as np
 from engram.errors import InputError
 from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.report import MergeReport
-from engram.fleet.merge.settings import MergeOptions
 from engram.geometry.se3 import SE3
 from engram.graph.model import (
     Attempt,

@@ -24,8 +24,8 @@ from pathlib import Path
 
 import numpy as np
 
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.fleet.merge.merging import merge
-from engram.fleet.merge.settings import MergeOptions
 from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, path_id
 from engram.maps.map import Map

@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.calibration.cameras import Cameras
+from engram.calibration.calibrated_pair import Cameras
 from engram.calibration.toml import calibration_toml
 from engram.frontend.frame import StereoPair
-from engram.sequences.motion import Trajectory, write_tum
+from engram.sequences.motion_files import Trajectory, write_tum
 from engram_lab.town.campaigns import campaign_named
 from engram_lab.town.session import SimulatedDrive
 

@@ -44,7 +44,7 @@ from engram.maps.writer import RevisionWriter
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.places.vocabulary import encode_vocabulary, one_word_vocabulary
 from engram.sequences.framelog.file import FrameLogHeader
-from engram.sequences.framelog.writer import FlightWriter, FrameLogWriter
+from engram.sequences.framelog.log_writer import FlightWriter, FrameLogWriter
 from engram.sequences.sequence import LoggedFrame, SequenceInfo
 from engram_lab.synthetic_places import (
     CAMERA,

@@ -19,7 +19,7 @@ from engram.fleet.centre.application import create_app
 from engram.fleet.centre.merge_job import merge_hand_in
 from engram.fleet.centre.service import Centre, CentreSettings, MapPolicy
 from engram.fleet.centre.worker import work_off
-from engram.fleet.merge.settings import MergeOptions
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.fleet.transfers import (
     MAX_PART_BYTES,
     Manifest,

@@ -17,8 +17,8 @@ from engram.cli.settings import read_settings
 from engram.config import load_toml
 from engram.errors import EngramError
 from engram.fleet.centre.merge_job import write_checked
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.fleet.merge.merging import merge
-from engram.fleet.merge.settings import MergeOptions
 from engram.fleet.transfers import Manifest, decode_manifest, split
 from engram.graph.clock import check_zone, hour_of_day, zone_note
 from engram.graph.model import Clock
@@ -26,8 +26,8 @@ from engram.maps.map import Map
 from engram.maps.map_files import check_file, copy_map
 from engram.places.vocabulary import decode_vocabulary
 from engram.sequences.framelog.file import FLIGHT_SUFFIX
+from engram.sequences.framelog.log_writer import read_decisions, read_images, read_report
 from engram.sequences.framelog.reader import FrameLog
-from engram.sequences.framelog.writer import read_decisions, read_images, read_report
 from engram.sequences.sequence import SequenceInfo
 from engram_lab.mutations.case import Case, Subject
 

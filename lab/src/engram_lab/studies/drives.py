@@ -29,7 +29,7 @@ from engram.maps.map import Map
 from engram.robot.localisers import session_of_drive
 from engram.robot.settings import Settings
 from engram.sequences.framelog.reader import FrameLog
-from engram.sequences.motion import Trajectory
+from engram.sequences.motion_files import Trajectory
 from engram.sequences.sequence import LoggedFrame
 from engram_lab.town.campaigns import WORLD_VERSION, Campaign, Size, campaign_named
 from engram_lab.town.simulating import Upkeep, bring_up_to_date, campaign_folder, known_frontends

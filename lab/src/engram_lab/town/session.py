@@ -13,7 +13,7 @@ from engram.frontend.frame import StereoPair
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram.graph.model import Clock
-from engram.sequences.motion import Trajectory
+from engram.sequences.motion_files import Trajectory
 from engram.sequences.sequence import SequenceInfo
 from engram_lab.town.camera_model import CameraModel
 from engram_lab.town.campaigns import Campaign, SessionPlan

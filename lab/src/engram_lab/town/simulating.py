@@ -29,9 +29,9 @@ from engram.processes import run_in_processes
 from engram.robot.mapping import extract_log
 from engram.robot.settings import Settings
 from engram.sequences.framelog.file import FrameLogHeader
+from engram.sequences.framelog.log_writer import FrameLogWriter
 from engram.sequences.framelog.reader import FrameLog
-from engram.sequences.framelog.writer import FrameLogWriter
-from engram.sequences.motion import write_tum
+from engram.sequences.motion_files import write_tum
 from engram.sequences.sequence import LoggedFrame
 from engram_lab.town.campaigns import WORLD_VERSION, Campaign
 from engram_lab.town.session import SimulatedSequence

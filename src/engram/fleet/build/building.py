@@ -45,9 +45,9 @@ from engram.fleet.build.scratch import (
     sole_builder,
     write_kept,
 )
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.report import MergeReport
-from engram.fleet.merge.settings import MergeOptions
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Session, SessionId, path_id
 from engram.maps.map import Map
@@ -216,21 +216,21 @@ def find_best_order(
     with monitor.stage("try orders", judge.orders.of(len(maps))) as stage:
         search.below((), root, stage)
     search.check_root()
-    search.found.results.sort(key=lambda one: one.rank)
+    search.found.results.sort(key=lambda result: result.rank)
     return search.found
 
 
 def results_in(folder: Path) -> list[OrderResult]:
     """Results of earlier searches in a folder, best first; all must have the same inputs."""
-    found = []
+    results = []
     for path in sorted(folder.glob("order-*.json")):
         try:
             step = read_kept(path, _Step)
         except ConfigError:  # partial, after a power cut
             continue
         if step.result is not None:
-            found.append(step.result)
-    return sorted(found, key=lambda one: one.rank)
+            results.append(step.result)
+    return sorted(results, key=lambda result: result.rank)
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,7 +271,7 @@ class _Search:
         hashes = []
         for path in (*maps, *([] if root is None else [root])):
             with Map.open(path) as store:
-                mapped += [(one, f"in {path}") for one in store.sessions.values()]
+                mapped += [(session, f"in {path}") for session in store.sessions.values()]
                 hashes.append(store.content_hash())
         check_held_out(judge, mapped)
         self._root_hash = None if root is None else hashes[-1]
@@ -334,7 +334,7 @@ class _Search:
         return {
             "merges": 1,
             "merge_s": time.perf_counter() - started,
-            "replayed": sum(one.taken + one.omitted for one in report.segments),
+            "replayed": sum(segment.taken + segment.omitted for segment in report.segments),
             "attempts": report.match_attempts,
             "proposed": report.proposed_attempts,
             "lookups": report.lookups,
@@ -344,8 +344,8 @@ class _Search:
         with Map.open(place) as opened:
             drives, reported = (
                 [
-                    self._localise(opened, one, self._settings, self._judge.localising)
-                    for one in sequences
+                    self._localise(opened, sequence, self._settings, self._judge.localising)
+                    for sequence in sequences
                 ]
                 for sequences in (self._sequences, self._reported)
             )
@@ -478,9 +478,11 @@ class BuildReport:
 
     def to_dict(self) -> dict[str, Any]:
         """What ``build --json`` prints."""
-        values = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "best"}
+        values = {
+            field.name: getattr(self, field.name) for field in fields(self) if field.name != "best"
+        }
         return {
-            **plain({**values, "merges": [one.to_dict() for one in self.merges]}),
+            **plain({**values, "merges": [merge.to_dict() for merge in self.merges]}),
             "best_order": None if self.best is None else self.best.to_dict(),
             "parallel_s": self.parallel_s,
         }
@@ -488,13 +490,13 @@ class BuildReport:
     @property
     def parallel_s(self) -> float:
         """Wall time with a worker per group: the slowest group, then all merges, seconds."""
-        slowest = max((one.seconds for one in self.mapped), default=0.0)
+        slowest = max((group.seconds for group in self.mapped), default=0.0)
         return slowest + self.merged_s
 
     @property
     def merged_s(self) -> float:
         """Wall time of all merges, those of earlier runs included, seconds."""
-        return self.merged_before_s + sum(one.seconds for one in self.merges)
+        return self.merged_before_s + sum(merge.seconds for merge in self.merges)
 
     def text(self) -> str:
         """The report as text."""
@@ -506,14 +508,14 @@ class BuildReport:
             lines.append(f"left out, already in {self.centre}: {known}")
         if not self.groups:
             return "\n".join([*lines, f"{self.centre}: nothing new; content {self.content_hash}"])
-        for names, one in zip(self.groups, self.mapped, strict=True):
-            died = f", {counted(one.retries, 'worker')} died" if one.retries else ""
-            made = f"{counted(one.nodes, 'node')}, {one.seconds:.1f} s"
-            lines.append(f"group {one.number}: {counted(len(names), 'drive')}, {made}{died}")
-        lines += [one.text() for one in self.merges]
+        for names, group in zip(self.groups, self.mapped, strict=True):
+            died = f", {counted(group.retries, 'worker')} died" if group.retries else ""
+            made = f"{counted(group.nodes, 'node')}, {group.seconds:.1f} s"
+            lines.append(f"group {group.number}: {counted(len(names), 'drive')}, {made}{died}")
+        lines += [merge.text() for merge in self.merges]
         if self.best is not None:
             lines += [self.best.text(), self._costs()]
-        mapped_s = sum(one.seconds for one in self.mapped)
+        mapped_s = sum(group.seconds for group in self.mapped)
         lines += [f"  note: {note}" for note in self.notes]
         lines.append(
             f"{self.centre}: content {self.content_hash}; mapping {mapped_s:.1f} s in "
@@ -525,7 +527,7 @@ class BuildReport:
     def _costs(self) -> str:
         """The cost of trying orders, compared with the cost models."""
         assert self.best is not None
-        mapped_s = sum(one.seconds for one in self.mapped)
+        mapped_s = sum(group.seconds for group in self.mapped)
         group_s = mapped_s / len(self.mapped)
         merge_s = self.best.spent.merge_s / max(self.best.spent.merges, 1)
         copy_s = self.best.spent.copy_s / max(self.best.spent.copies, 1)
@@ -638,20 +640,20 @@ def _look_at(sources: Sequence[str]) -> list[Drive]:
 def _known_sessions(scratch: Scratch) -> frozenset[SessionId]:
     """The drives that the fleet map had in full when the build began."""
     if scratch.unfinished is not None:
-        return frozenset(SessionId(UUID(one)) for one in scratch.unfinished.known)
+        return frozenset(SessionId(UUID(session)) for session in scratch.unfinished.known)
     if not scratch.centre.exists():
         return frozenset()
     with Map.open(scratch.centre) as store:
         partial = store.partial_paths
-        return frozenset(one for one in store.frontends if path_id(one) not in partial)
+        return frozenset(session for session in store.frontends if path_id(session) not in partial)
 
 
 def _check_judges(judge: JudgeOptions, drives: Sequence[Drive], centre: Path) -> None:
     """Checks before mapping, which takes hours, that the judging drives are held out."""
-    mapped = [(one.session, f"{one.source}, a drive of this build") for one in drives]
+    mapped = [(drive.session, f"{drive.source}, a drive of this build") for drive in drives]
     if centre.exists():
         with Map.open(centre) as store:
-            mapped += [(one, f"in {centre} already") for one in store.sessions.values()]
+            mapped += [(session, f"in {centre} already") for session in store.sessions.values()]
     check_held_out(judge, mapped)
 
 
@@ -699,7 +701,11 @@ def _map(
 ) -> list[GroupResult]:
     tasks = [
         GroupTask(
-            number, scratch.group(number), [one.source for one in group], settings, options.mapping
+            number,
+            scratch.group(number),
+            [drive.source for drive in group],
+            settings,
+            options.mapping,
         )
         for number, group in enumerate(grouped)
     ]

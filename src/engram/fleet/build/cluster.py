@@ -83,13 +83,13 @@ def run_on_cluster(
         while names:
             monitor.check()
             try:
-                said = heard.get(timeout=LISTEN_S)
+                message = heard.get(timeout=LISTEN_S)
             except queue.Empty:
                 continue
-            words = said
-            if not isinstance(said, list):
-                name = names.pop(said)
-                result, words = _outcome(said, name, scheduler)
+            words = message
+            if not isinstance(message, list):
+                name = names.pop(message)
+                result, words = _outcome(message, name, scheduler)
                 done(name, result)
             for word in words:
                 monitor.advance(word)
@@ -165,12 +165,12 @@ def _on_worker(
         if known is None or known.state == "cancelled":
             raise _GivenUpError
 
-    told = WordsTogether(send)
+    unsent = WordsTogether(send)
     try:
-        result = work(task, told)
+        result = work(task, unsent)
     except EngramError as error:
         return error
-    return result, told.take()
+    return result, unsent.take()
 
 
 def _outcome(future: Future, name: str, scheduler: str) -> tuple[Any, list[str]]:

@@ -100,8 +100,8 @@ def check_held_out(judge: JudgeOptions, mapped: Sequence[tuple[Session, str]]) -
     Args:
         mapped: the sessions of the maps, each with its place in words.
     """
-    where = {one.id: words for one, words in mapped}
-    known = [one for one, _ in mapped]
+    where = {session.id: words for session, words in mapped}
+    known = [session for session, _ in mapped]
     for path in (*judge.drives, *judge.reported):
         sequence = open_drive(path)
         held = held_as(sequence, known)
@@ -202,16 +202,16 @@ class BestOrder:
 
     def spread(self) -> dict[str, dict[str, float]]:
         """P(X ≥ x) at 5, 10 and 20 m over the orders: lowest, median, highest, best order."""
-        found = {}
+        spreads = {}
         for at in self.results[0].at_m:
-            values = [one.at_m[at] for one in self.results]
-            found[at] = {
+            values = [result.at_m[at] for result in self.results]
+            spreads[at] = {
                 "least": min(values),
                 "median": float(np.median(values)),
                 "most": max(values),
                 "best": self.results[0].at_m[at],
             }
-        return found
+        return spreads
 
     def to_dict(self) -> dict[str, Any]:
         """What ``build --json`` prints."""
@@ -228,18 +228,18 @@ class BestOrder:
 
     def text(self) -> str:
         """The result as text."""
-        told = " ".join(map(str, self.order))
+        order = " ".join(map(str, self.order))
         lines = [
-            f"best of {counted(len(self.results), 'order')}: {told}, P(no match within "
+            f"best of {counted(len(self.results), 'order')}: {order}, P(no match within "
             f"{self.judge_at_m:g} m, {self.estimator}) {self.results[0].judged:.2%}; "
             f"{counted(self.spent.merges, 'merge')} in {self.spent.merge_s:.1f} s, "
             f"{counted(self.spent.copies, 'copy')} in {self.spent.copy_s:.1f} s, "
             f"judging {self.spent.judge_s:.1f} s"
         ]
         lines += [
-            f"  P(X >= {at} m, {self.estimator}): least {one['least']:.2%}, "
-            f"median {one['median']:.2%}, most {one['most']:.2%}, best order {one['best']:.2%}"
-            for at, one in self.spread().items()
+            f"  P(X >= {at} m, {self.estimator}): least {p['least']:.2%}, "
+            f"median {p['median']:.2%}, most {p['most']:.2%}, best order {p['best']:.2%}"
+            for at, p in self.spread().items()
         ]
         return "\n".join(lines)
 

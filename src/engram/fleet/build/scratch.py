@@ -75,8 +75,8 @@ def map_group(task: GroupTask, monitor: Monitor = QUIET) -> GroupResult:
     result = GroupResult(task.number)
     started, cpu_started = time.perf_counter(), time.process_time()
     with open_map(task.path, create=True) as store, store.writing():
-        for one in store.interrupted():
-            store.resume_session(one.session.id).abandon()
+        for interrupted in store.interrupted():
+            store.resume_session(interrupted.session.id).abandon()
     for source in task.sources:
         with fetched(source) as drive:
             report = map_drive(task.path, open_drive(drive), task.settings, task.options, monitor)
@@ -93,10 +93,10 @@ def map_group(task: GroupTask, monitor: Monitor = QUIET) -> GroupResult:
 def map_group_far_away(task: GroupTask, monitor: Monitor = QUIET) -> tuple[GroupResult, bytes]:
     """Maps a group on a machine that shares no disk with the caller; returns the map's bytes."""
     with tempfile.TemporaryDirectory(prefix="engram-group-") as folder:
-        here = replace(task, path=Path(folder) / "group.engram")
-        result = map_group(here, monitor)
+        local = replace(task, path=Path(folder) / "group.engram")
+        result = map_group(local, monitor)
         whole = Path(folder) / "whole.engram"
-        copy_map(here.path, whole)  # without the write-ahead log beside it
+        copy_map(local.path, whole)  # without the write-ahead log beside it
         return result, whole.read_bytes()
 
 
@@ -153,7 +153,7 @@ class BuildPlan:
 
     def same_groups(self, other: BuildPlan) -> bool:
         """Whether both builds have the same maps of the groups."""
-        mine, theirs = ((one.groups, one.settings, one.mapping) for one in (self, other))
+        mine, theirs = ((plan.groups, plan.settings, plan.mapping) for plan in (self, other))
         return mine == theirs
 
 
@@ -344,7 +344,7 @@ class Scratch:
         with keeping(self.folder):
             if not self.folder.exists():
                 return
-            strange = [one.name for one in self.folder.iterdir() if one.suffix != ".part"]
+            strange = [path.name for path in self.folder.iterdir() if path.suffix != ".part"]
         if strange:
             raise ConfigError(
                 f"{self.folder} holds {sorted(strange)[0]}, but no plan of a build; delete the "
@@ -364,7 +364,7 @@ class Scratch:
     def _clear(self) -> None:
         """Removes everything but the plan, results before their maps."""
         with keeping(self.folder):
-            for path in sorted(self.folder.iterdir(), key=lambda one: one.suffix != ".json"):
+            for path in sorted(self.folder.iterdir(), key=lambda file: file.suffix != ".json"):
                 if path.is_dir():
                     shutil.rmtree(path)
                 elif path != self._plan_path:

@@ -22,7 +22,7 @@ from engram.fleet.centre.database import ServiceDatabase, note
 from engram.fleet.centre.objects import BucketObjects, FolderObjects, Objects, Packs
 from engram.fleet.centre.problems import UnknownError
 from engram.fleet.centre.tables import JobState, MapListed, artifacts, handins, maps, refs
-from engram.fleet.merge.settings import MergeOptions
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.maps.map import Map
 from engram.maps.map_reader import MapReader
 from engram.maps.records import Revision

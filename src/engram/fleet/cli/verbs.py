@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from engram.fleet.build.orders import JudgeOptions
     from engram.fleet.download.downloading import DownloadReport
     from engram.fleet.download.updating import UpdateReport
+    from engram.fleet.merge.merge_settings import MergeOptions
     from engram.fleet.merge.report import MergeReport
-    from engram.fleet.merge.settings import MergeOptions
 
 
 def merge(
@@ -130,7 +130,7 @@ def _merges(reports: list[MergeReport]) -> dict[str, Any]:
 
 def merging_of(settings: AllSettings) -> MergeOptions:
     """How the settings say that maps are merged."""
-    from engram.fleet.merge.settings import MergeOptions
+    from engram.fleet.merge.merge_settings import MergeOptions
 
     return MergeOptions.of(settings.merge, os.environ.get(AUTHOR))
 

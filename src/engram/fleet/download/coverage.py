@@ -110,11 +110,11 @@ def tallies(stock: Stock, basin: MatchBasin) -> tuple[Array, Array]:
         pairs = (made.session, stock.session_of[made.node])
         np.add.at(won, pairs, made.accepted)
         np.add.at(expected, pairs, rate)
-    told = set(np.unique(made.session).tolist())
-    by_path = {path_id(one.id): at for at, one in enumerate(stock.sessions)}
+    remembered = set(np.unique(made.session).tolist())
+    by_path = {path_id(session.id): at for at, session in enumerate(stock.sessions)}
     for entry in stock.entries:
         at = by_path.get(entry.path)
-        if at is not None and at not in told and entry.kind is not PathEntryKind.SAVED:
+        if at is not None and at not in remembered and entry.kind is not PathEntryKind.SAVED:
             other = stock.session_of[stock.index[entry.node]]
             won[at, other] += 1
             expected[at, other] += 1
@@ -125,8 +125,8 @@ def hours_apart(stock: Stock) -> Array:
     """(S, S) difference in hour of day, 0 to 12 hours; NaN if either is unknown."""
     hours = np.array(
         [
-            np.nan if (hour := hour_of_day(one, one.start_ns)) is None else hour
-            for one in stock.sessions
+            np.nan if (hour := hour_of_day(session, session.start_ns)) is None else hour
+            for session in stock.sessions
         ],
         np.float64,
     )
@@ -185,7 +185,9 @@ def importance(stock: Stock, options: DownloadOptions) -> Array:
     """(S,) weight of each past session for a mission; all 1 if the mission has no time."""
     if options.depart_h is None:
         return np.ones(len(stock.sessions))
-    hours = np.array([_nan(hour_of_day(one, one.start_ns)) for one in stock.sessions], np.float64)
+    hours = np.array(
+        [_nan(hour_of_day(session, session.start_ns)) for session in stock.sessions], np.float64
+    )
     latitude_deg = None if not np.isfinite(hours).all() else latitude_of(stock, options)
     if latitude_deg is None:
         return _near_in_hours(hours, options, _MISSION_H) + _LEAST_WEIGHT
@@ -203,7 +205,9 @@ def light_apart_deg(stock: Stock, options: DownloadOptions) -> float | None:
         Degrees, between dusk and a low sun, beyond which light hardly changes; None if hours or
         latitude are unknown.
     """
-    hours = np.array([_nan(hour_of_day(one, one.start_ns)) for one in stock.sessions], np.float64)
+    hours = np.array(
+        [_nan(hour_of_day(session, session.start_ns)) for session in stock.sessions], np.float64
+    )
     if options.depart_h is None or not np.isfinite(hours).all():
         return None
     latitude_deg = latitude_of(stock, options)
@@ -216,10 +220,12 @@ def light_apart_deg(stock: Stock, options: DownloadOptions) -> float | None:
 
 def nearest_hours(stock: Stock, options: DownloadOptions) -> float:
     """Hours from a mission's start to the time of day of the nearest drive; infinite if unknown."""
-    starts = [hour_of_day(one, one.start_ns) for one in stock.sessions]
+    starts = [hour_of_day(session, session.start_ns) for session in stock.sessions]
     if options.depart_h is None:
         return np.inf
-    apart = [abs((options.depart_h - one + 12) % 24 - 12) for one in starts if one is not None]
+    apart = [
+        abs((options.depart_h - start + 12) % 24 - 12) for start in starts if start is not None
+    ]
     return min(apart, default=np.inf)
 
 
@@ -241,12 +247,14 @@ def learnt_latitude(stock: Stock) -> float | None:
     """
     if not stock.sessions:
         return None
-    focal_px = float(np.median([one.fx for one in stock.contents.cameras.values()]))
+    focal_px = float(np.median([camera.fx for camera in stock.contents.cameras.values()]))
     won, tried = tallies(stock, MatchBasin.of(focal_px))
-    hours = np.array([_nan(hour_of_day(one, one.start_ns)) for one in stock.sessions], np.float64)
+    hours = np.array(
+        [_nan(hour_of_day(session, session.start_ns)) for session in stock.sessions], np.float64
+    )
     np.fill_diagonal(tried, 0.0)
-    told = (tried.sum(axis=0) + tried.sum(axis=1)) * np.isfinite(hours)
-    judged = np.sort(np.argsort(-told, kind="stable")[:_JUDGED_SESSIONS])
+    evidence = (tried.sum(axis=0) + tried.sum(axis=1)) * np.isfinite(hours)
+    judged = np.sort(np.argsort(-evidence, kind="stable")[:_JUDGED_SESSIONS])
     pairs = _Pairs.of(won[np.ix_(judged, judged)], tried[np.ix_(judged, judged)])
     if not len(pairs.tried):
         return None
@@ -293,16 +301,16 @@ class _Pairs:
         terms[rows, 2 + self.sessions + self.donor] = 1.0
         level, slope, each = _PRIORS
         precision = np.concatenate([[level, slope], np.full(2 * self.sessions, each)])
-        found = np.zeros(len(precision))
+        weights = np.zeros(len(precision))
         for _ in range(_ROUNDS):
-            rate = _logistic(terms @ found)
+            rate = _logistic(terms @ weights)
             spread = self.tried * rate * (1 - rate)
             curvature = (terms * spread[:, None]).T @ terms + np.diag(precision)
-            uphill = terms.T @ (self.won - self.tried * rate) - precision * found
-            found += np.clip(np.linalg.solve(curvature, uphill), -2.0, 2.0)
-        rate = np.clip(_logistic(terms @ found), 1e-6, 1 - 1e-6)
+            uphill = terms.T @ (self.won - self.tried * rate) - precision * weights
+            weights += np.clip(np.linalg.solve(curvature, uphill), -2.0, 2.0)
+        rate = np.clip(_logistic(terms @ weights), 1e-6, 1 - 1e-6)
         likelihood = self.won @ np.log(rate) + (self.tried - self.won) @ np.log(1 - rate)
-        return float(likelihood - 0.5 * precision @ found**2), float(found[1])
+        return float(likelihood - 0.5 * precision @ weights**2), float(weights[1])
 
 
 def _near_in_hours(hours: Array, options: DownloadOptions, spread_h: float) -> Array:
@@ -323,7 +331,7 @@ def _mission_heights(
     if options.date is not None:
         day = float(date.fromisoformat(options.date).timetuple().tm_yday - 1)
     else:
-        day = day_of_year(max(one.begin_ns for one in stock.sessions))
+        day = day_of_year(max(session.begin_ns for session in stock.sessions))
     arrive_h = options.depart_h if options.arrive_h is None else options.arrive_h
     span = np.linspace(0.0, (arrive_h - options.depart_h) % 24, 25)
     hours = (options.depart_h + span) % 24
@@ -332,7 +340,7 @@ def _mission_heights(
 
 
 def _heights(stock: Stock, hours: Array, latitude_deg: float) -> Array:
-    days = np.array([day_of_year(one.begin_ns) for one in stock.sessions], np.float64)
+    days = np.array([day_of_year(session.begin_ns) for session in stock.sessions], np.float64)
     return sun_height_deg(days, hours, latitude_deg)
 
 
@@ -624,8 +632,9 @@ class Forecast:
 
     def text(self) -> str:
         """The forecast as one line of text."""
-        told = ", ".join(
-            f"{weather} " + ("not known" if one is None else f"{one[0]:.1%} to {one[1]:.1%}")
-            for weather, one in self.missed.items()
+        shares = ", ".join(
+            f"{weather} "
+            + ("not known" if interval is None else f"{interval[0]:.1%} to {interval[1]:.1%}")
+            for weather, interval in self.missed.items()
         )
-        return f"route without a match in {LEVEL:.0%} of such missions: {told}"
+        return f"route without a match in {LEVEL:.0%} of such missions: {shares}"

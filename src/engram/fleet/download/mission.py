@@ -87,10 +87,10 @@ def hour_from_text(text: str | None, name: str) -> float | None:
     """Hour of day of "9", "9:30" or "09:30"; None of None."""
     if text is None:
         return None
-    found = _CLOCK.fullmatch(text.strip())
-    if found is None or int(found["hour"]) > 23 or int(found["minute"] or 0) > 59:
+    match = _CLOCK.fullmatch(text.strip())
+    if match is None or int(match["hour"]) > 23 or int(match["minute"] or 0) > 59:
         raise ConfigError(f"{name} is {text!r}, must be a time of day such as 9:30 or 23:05")
-    return int(found["hour"]) + int(found["minute"] or 0) / 60
+    return int(match["hour"]) + int(match["minute"] or 0) / 60
 
 
 def budget_from_text(text: str | None) -> tuple[int | None, float | None]:
@@ -102,14 +102,14 @@ def budget_from_text(text: str | None) -> tuple[int | None, float | None]:
         return None, None
     if share := _PERCENT.fullmatch(text.strip()):
         return None, float(share["number"])
-    found = _SIZE.fullmatch(text.strip())
-    unit = found["unit"].removesuffix("B") if found else ""
-    if found is None or unit not in _UNITS:
+    match = _SIZE.fullmatch(text.strip())
+    unit = match["unit"].removesuffix("B") if match else ""
+    if match is None or unit not in _UNITS:
         raise ConfigError(
             f"budget is {text!r}, must be a size such as 200MB, 1.5GiB or 4096, or a share of "
             "everything such as 25%"
         )
-    return int(float(found["number"]) * _UNITS[unit]), None
+    return int(float(match["number"]) * _UNITS[unit]), None
 
 
 def _check_day(text: str) -> None:

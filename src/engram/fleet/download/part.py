@@ -69,11 +69,11 @@ class Stock:
         self.store = store
         self.contents = store.load()
         self.sessions: list[Session] = sorted(
-            self.contents.sessions, key=lambda one: (one.start_ns, one.id)
+            self.contents.sessions, key=lambda session: (session.start_ns, session.id)
         )
-        place = {one.id: at for at, one in enumerate(self.sessions)}
+        place = {session.id: at for at, session in enumerate(self.sessions)}
         self.nodes: list[Node] = sorted(
-            self.contents.nodes, key=lambda one: (place[one.session], one.stamp_ns, one.id)
+            self.contents.nodes, key=lambda node: (place[node.session], node.stamp_ns, node.id)
         )
         self.index = {node.id: at for at, node in enumerate(self.nodes)}
         self.edges: list[Edge] = sorted(
@@ -113,15 +113,21 @@ class Stock:
     @cached_property
     def hours(self) -> Array:
         """(N,) hour of day of each node (method §2.8), NaN if unknown."""
-        by_id = {one.id: one for one in self.sessions}
+        by_id = {session.id: session for session in self.sessions}
         known = (hour_of_day(by_id[node.session], node.stamp_ns) for node in self.nodes)
         return np.array([np.nan if hour is None else hour for hour in known], np.float64)
 
     def known_hours(self) -> Array:
         """`hours` (N,), at least one of which is known."""
         if not np.isfinite(self.hours).any():
-            without = [one for one in self.sessions if hour_of_day(one, one.start_ns) is None]
-            listed = ", ".join(f"{one.robot} {str(one.id)[:8]}" for one in without[:_LISTED])
+            without = [
+                session
+                for session in self.sessions
+                if hour_of_day(session, session.start_ns) is None
+            ]
+            listed = ", ".join(
+                f"{session.robot} {str(session.id)[:8]}" for session in without[:_LISTED]
+            )
             raise InputError(
                 f"{_zones_told(without)}no node of {self.store.location} has a known hour of day: "
                 f"{len(without)} of {len(self.sessions)} sessions ({listed}…) have no UTC clock or "
@@ -147,16 +153,16 @@ class Stock:
     def attempts(self) -> Attempts:
         """Remembered attempts; sessions and nodes are places in `sessions` and `nodes`."""
         made = self.contents.attempts
-        place = {one.id: at for at, one in enumerate(self.sessions)}
-        session = np.array([place[one.id] for one in self.contents.sessions], np.int32)
-        node = np.array([self.index[one.id] for one in self.contents.nodes], np.int32)
-        found = replace(
+        place = {session.id: at for at, session in enumerate(self.sessions)}
+        session = np.array([place[session.id] for session in self.contents.sessions], np.int32)
+        node = np.array([self.index[node.id] for node in self.contents.nodes], np.int32)
+        attempts = replace(
             made,
             session=session[made.session],
             reference=node[made.reference],
             node=node[made.node],
         )
-        return found.rows(np.argsort(found.session, kind="stable"))
+        return attempts.rows(np.argsort(attempts.session, kind="stable"))
 
     @cached_property
     def basin_counts(self) -> BasinCounts:
@@ -167,8 +173,8 @@ class Stock:
     @cached_property
     def sizes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """(N,) bytes of the landmarks of each node, and (N,) of its thumbnail."""
-        found = self.store.blob_sizes
-        both = np.array([found[node] for node in self.node_ids], np.int64).reshape(-1, 2)
+        sizes = self.store.blob_sizes
+        both = np.array([sizes[node] for node in self.node_ids], np.int64).reshape(-1, 2)
         return both[:, 0], both[:, 1]
 
     def named_node(self, prefix: str) -> int:
@@ -180,12 +186,12 @@ class Stock:
 
     def place_of(self, session: SessionId) -> int:
         """Place of a session in `sessions`."""
-        return next(at for at, one in enumerate(self.sessions) if one.id == session)
+        return next(at for at, candidate in enumerate(self.sessions) if candidate.id == session)
 
 
 def _zones_told(sessions: Sequence[Session]) -> str:
     """Why the hours of these sessions are unknown although they have zones."""
-    notes = {note: None for one in sessions if (note := zone_note(one))}
+    notes = {note: None for session in sessions if (note := zone_note(session))}
     return "".join(f"{note}; " for note in notes)
 
 
@@ -396,13 +402,13 @@ class Part:
     def sessions(self) -> list[Session]:
         """Sessions that saved, passed or attempted a sent node; all of a whole map."""
         wanted = self._sessions_wanted()
-        return [one for at, one in enumerate(self.stock.sessions) if wanted[at]]
+        return [session for at, session in enumerate(self.stock.sessions) if wanted[at]]
 
     @property
     def amendments(self) -> list[Amendment]:
         """Amendments of the sessions."""
-        sent = {one.id for one in self.sessions}
-        return [one for one in self.stock.store.amendments if one.session in sent]
+        sent = {session.id for session in self.sessions}
+        return [amendment for amendment in self.stock.store.amendments if amendment.session in sent]
 
     def stored(self, lacking: Mask | None = None) -> Iterator[StoredNode]:
         """The nodes with their blobs.
@@ -412,23 +418,29 @@ class Part:
         """
         wanted = self.sent if lacking is None else self.sent & lacking
         nodes = [self.stock.nodes[at] for at in np.flatnonzero(wanted)]
-        for one in self.stock.store.frames.stored(nodes):
-            yield one if self.thumbnails else replace(one, thumbnail=None)
+        for stored in self.stock.store.frames.stored(nodes):
+            yield stored if self.thumbnails else replace(stored, thumbnail=None)
 
     def edges(self) -> Iterator[Edge]:
         """Edges between sent nodes, then bridges."""
         index, sent = self.stock.index, self.sent
-        yield from (one for one in self.stock.edges if sent[index[one.a]] and sent[index[one.b]])
+        yield from (
+            edge for edge in self.stock.edges if sent[index[edge.a]] and sent[index[edge.b]]
+        )
         yield from self.bridges
 
     def entries(self) -> Iterator[PathEntry]:
         """Path entries at sent nodes, by path and sequence."""
         index, sent = self.stock.index, self.sent
-        return (one for one in self.stock.entries if sent[index[one.node]])
+        return (entry for entry in self.stock.entries if sent[index[entry.node]])
 
     def omissions(self) -> list[Omission]:
         """Omissions that go along, by the UUID of the omitted node."""
-        return [one for _, one in sorted(self.stock.store.omissions.items())] if self.whole else []
+        return (
+            [omission for _, omission in sorted(self.stock.store.omissions.items())]
+            if self.whole
+            else []
+        )
 
     def partial_paths(self) -> set[PathId]:
         """Paths of which some entries are left out, now or by an earlier download."""
@@ -550,7 +562,7 @@ def lacking_marks(part: Part, own: Map) -> list[Mark]:
 def _one_frame(own: Mapping[NodeId, SE3], fleet: Mapping[NodeId, SE3]) -> bool:
     shared = [node for node in own if node in fleet]
     apart = (own[node].inverse() @ fleet[node] for node in shared)
-    return bool(shared) and all(one.distance_m <= _SAME_FRAME_M for one in apart)
+    return bool(shared) and all(offset.distance_m <= _SAME_FRAME_M for offset in apart)
 
 
 def _goals(part: Part) -> Iterator[Goal]:

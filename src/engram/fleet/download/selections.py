@@ -124,14 +124,14 @@ def mission_epochs(
             "use --select copy, region or route"
         )
     epochs = _between(depart_h, arrive_h, buffer_min, counts.epoch_min, filled)
-    found = [epoch for epoch in epochs if epoch in set(filled.tolist())]
-    if not found:
+    wider = [epoch for epoch in epochs if epoch in set(filled.tolist())]
+    if not wider:
         raise InputError(
             f"no epoch from {_told(depart_h, 'first')} to {_told(arrive_h, 'last')} has data; "
             f"there is some from {_spans(filled.tolist(), counts.epoch_min)}: choose other times, "
             "or widen them with --set download.buffer_min=MINUTES"
         )
-    return found
+    return wider
 
 
 def _between(
@@ -279,7 +279,7 @@ def _everything(options: DownloadOptions) -> dict[str, Any]:
 
 
 def _mission(options: DownloadOptions) -> str:
-    ends = [_hour_text(one) for one in (options.depart_h, options.arrive_h) if one is not None]
+    ends = [_hour_text(hour) for hour in (options.depart_h, options.arrive_h) if hour is not None]
     return " to ".join(dict.fromkeys(ends)) or "the mission"
 
 
@@ -410,7 +410,9 @@ def check_options(options: DownloadOptions) -> None:
     for name, flag in _FLAGS.items():
         if getattr(options, name) == _DEFAULTS[name] or name in UNDERSTOOD[select]:
             continue
-        *others, last = [one for one, understood in UNDERSTOOD.items() if name in understood]
+        *others, last = [
+            selection for selection, understood in UNDERSTOOD.items() if name in understood
+        ]
         takers = f"{', '.join(others)} or {last}" if others else last
         raise ConfigError(
             f"selection {select} does not use {flag}; leave it out, or choose --select {takers}"
@@ -461,10 +463,10 @@ def within(stock: Stock, seeds: NDArray[np.int64], radius_m: float) -> Mask:
 
 def along_route(stock: Stock, session: str, radius_m: float) -> Mask:
     """(N,) bool, the nodes within a distance of a session's path, along the edges."""
-    found = stock.store.named_session(session)
-    seeds = stock.on_path.get(path_id(found.id))
+    named = stock.store.named_session(session)
+    seeds = stock.on_path.get(path_id(named.id))
     if seeds is None:
-        raise InputError(f"session {found.id} of {found.robot} has no node on its path")
+        raise InputError(f"session {named.id} of {named.robot} has no node on its path")
     return within(stock, np.unique(seeds), radius_m)
 
 

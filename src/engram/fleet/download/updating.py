@@ -24,7 +24,7 @@ from engram.fleet.download.downloading import choose_part, revision_of
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Mask, Part, Stock, lacking_marks
 from engram.fleet.download.selections import SELECTIONS, check_options, facts_told
-from engram.fleet.merge.state import FIRST_REPLAYED, position_of, uncertainty_m2
+from engram.fleet.merge.open_merge import FIRST_REPLAYED, position_of, uncertainty_m2
 from engram.graph.model import (
     Edge,
     EdgeKind,
@@ -176,7 +176,7 @@ class _Update:
         partial = self._part.partial_paths()
         for session in self._part.sessions:
             self._counts["sessions"] += self._part.add_session(writer, session, partial)
-        amended = [writer.add_amendment(one) for one in self._part.amendments]
+        amended = [writer.add_amendment(amendment) for amendment in self._part.amendments]
         lacking = self._lacking_nodes()
         with monitor.stage("update", int(lacking.sum())) as stage:
             for stored in self._part.stored(lacking):
@@ -192,7 +192,9 @@ class _Update:
         entries = list(self._lacking_entries())
         attempts = self._lacking_attempts()
         known = {node.id for node in self._own.nodes} | self._map.omissions.keys()
-        omissions = [one for one in self._part.omissions() if one.omitted not in known]
+        omissions = [
+            omission for omission in self._part.omissions() if omission.omitted not in known
+        ]
         for edge in (*edges, *ties):
             writer.add_edge(edge)
         for entry in entries:
@@ -232,10 +234,10 @@ class _Update:
         """Matches of own nodes with the nodes by which the fleet map replaced them."""
         known = copied | {_key(edge) for edge in self._own.edges}
         own = {node.id for node in self._own.nodes}
-        here = own | set(self._part.node_ids)
+        present = own | set(self._part.node_ids)
         for omitted, omission in sorted(self._stock.store.omissions.items()):
             only_ours = omitted in own and omitted not in self._stock.index
-            if only_ours and omission.node in here:
+            if only_ours and omission.node in present:
                 at = position_of(omission)
                 tie = Edge(at.node, omitted, EdgeKind.MATCH, at.node_from_live, at.covariance)
                 if _key(tie) not in known:
@@ -268,7 +270,7 @@ class _Update:
         place: dict[Any, int] = {}
         for session in (*self._own.sessions, *self._stock.sessions):
             place.setdefault(session.id, len(place))
-        named = np.array([place[one.id] for one in self._stock.sessions], np.int32)
+        named = np.array([place[session.id] for session in self._stock.sessions], np.int32)
         theirs = replace(made, session=named[made.session])
         return rows[theirs.lacking(remembered)]
 
@@ -278,7 +280,7 @@ def _key(edge: Edge) -> tuple[NodeId, NodeId, EdgeKind]:
 
 
 def _check_fits(part: Part, own: Map, contents: MapContents) -> None:
-    known = {one.id: one.as_recorded for one in contents.sessions}
+    known = {session.id: session.as_recorded for session in contents.sessions}
     for session in part.sessions:
         ours = known.get(session.id)
         if ours is not None and not _same_drive(ours, session.as_recorded):

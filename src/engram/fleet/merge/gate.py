@@ -64,14 +64,16 @@ def check_held_out(
 def held_as(sequence: DriveSequence, sessions: Sequence[Session]) -> Session | None:
     """The session of this drive, whatever the robot's name; None if it is not in the map."""
     own = session_of_drive(sequence)
-    for one in sessions:
-        if one.id == own.id:
-            return one
-        named = one.as_recorded
+    for session in sessions:
+        if session.id == own.id:
+            return session
+        named = session.as_recorded
         if (named.camera, named.start_ns) != (own.camera, own.start_ns):
             continue
-        if one.id == session_id(named.robot, named.camera, named.start_ns, _first_pair(sequence)):
-            return one
+        if session.id == session_id(
+            named.robot, named.camera, named.start_ns, _first_pair(sequence)
+        ):
+            return session
     return None
 
 
@@ -129,7 +131,8 @@ class Gate:
     def _localise(self, store: Map, monitor: Monitor) -> list[Drive]:
         store.forget()  # during a merge the graph in memory is the merge's, not the file's
         return [
-            measure(store, one, self._settings, self._options, monitor) for one in self._sequences
+            measure(store, sequence, self._settings, self._options, monitor)
+            for sequence in self._sequences
         ]
 
 
@@ -189,19 +192,19 @@ class GeometryGate:
         """Finds the wrong edges that the fleet map has before the first merge."""
         if self._refuses:
             with Map.open(place) as store:
-                self._known = {_key(one) for one in self._wrong(store, monitor)}
+                self._known = {_key(finding) for finding in self._wrong(store, monitor)}
 
     def __call__(self, store: Map, source: str, monitor: Monitor) -> list[dict[str, Any]]:
         """The wrong edges of the fleet map with an open merge, as plain values."""
         wrong = self._wrong(store, monitor)
-        new = [one for one in wrong if _key(one) not in self._known]
+        new = [finding for finding in wrong if _key(finding) not in self._known]
         if self._refuses and new:
             raise RefusedError(
                 f"{source} would add {counted(len(new), 'wrong edge')}, the most certain of them: "
                 f"{new[0].text()}; repair it with engram check {source} --geometry --repair"
             )
-        self._known = {_key(one) for one in wrong}
-        return [one.to_dict() for one in wrong]
+        self._known = {_key(finding) for finding in wrong}
+        return [finding.to_dict() for finding in wrong]
 
     def _wrong(self, store: Map, monitor: Monitor) -> tuple[Finding, ...]:
         if not len(store.graph):
@@ -211,5 +214,5 @@ class GeometryGate:
         ).wrong
 
 
-def _key(one: Finding) -> _Key:
-    return one.edge.a, one.edge.b, one.edge.kind
+def _key(finding: Finding) -> _Key:
+    return finding.edge.a, finding.edge.b, finding.edge.kind

@@ -19,10 +19,8 @@ from engram.counts import counted
 from engram.errors import InputError
 from engram.files import draft_folder
 from engram.fleet.merge.gate import Gate, GeometryGate
-from engram.fleet.merge.replay import Replay, Segment, string_segments
-from engram.fleet.merge.report import MergeReport, picture_before_and_after
-from engram.fleet.merge.settings import MergeOptions
-from engram.fleet.merge.state import (
+from engram.fleet.merge.merge_settings import MergeOptions
+from engram.fleet.merge.open_merge import (
     Merge,
     check_fits,
     check_readable,
@@ -30,6 +28,8 @@ from engram.fleet.merge.state import (
     recomposed,
     uncertainty_m2,
 )
+from engram.fleet.merge.replay import Replay, Segment, string_segments
+from engram.fleet.merge.report import MergeReport, picture_before_and_after
 from engram.frontend.frame import DescriptorKind
 from engram.graph.model import Node, PathEntry, Session, SessionId, path_id
 from engram.graph.paths import Attempts
@@ -143,14 +143,18 @@ def _contributors(merge: Merge, new: Sequence[Node]) -> list[str]:
     driven = {
         path
         for path in paths.paths
-        if any(merge.new_entry(one) or not merge.knows(one.node) for one in paths.entries(path))
+        if any(
+            merge.new_entry(entry) or not merge.knows(entry.node) for entry in paths.entries(path)
+        )
     }
-    found = {
-        one.robot
-        for one in merge.sessions
-        if one.id not in merge.centre.sessions or one.id in saved or path_id(one.id) in driven
+    robots = {
+        session.robot
+        for session in merge.sessions
+        if session.id not in merge.centre.sessions
+        or session.id in saved
+        or path_id(session.id) in driven
     }
-    return sorted(found) or list(merge.report.robots)
+    return sorted(robots) or list(merge.report.robots)
 
 
 def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
@@ -178,8 +182,8 @@ def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
         merge.writer.add_mark(removal)
     for goal in merge.new_goals():
         merge.writer.add_mark(goal)
-    merge.report.taken = sum(one.taken for one in merge.report.segments)
-    merge.report.omitted += sum(one.omitted for one in merge.report.segments)
+    merge.report.taken = sum(segment.taken for segment in merge.report.segments)
+    merge.report.omitted += sum(segment.omitted for segment in merge.report.segments)
 
 
 def _take_vocabulary(merge: Merge) -> None:
@@ -205,9 +209,9 @@ def _add_session(merge: Merge, session: Session) -> None:
 def _unite_path(merge: Merge, session: Session, replay: Replay) -> list[PathEntry]:
     """Adds the drive's path as far as its nodes are known; returns the other entries."""
     entries = merge.robot.path_memory.entries(path_id(session.id))
-    merge.add_entries([one for one in entries if merge.knows(one.node)])
+    merge.add_entries([entry for entry in entries if merge.knows(entry.node)])
     merge.add_entries(replay.entries.get(session.id, []))
-    return [one for one in entries if not merge.knows(one.node)]
+    return [entry for entry in entries if not merge.knows(entry.node)]
 
 
 def _see_edges_again(merge: Merge) -> None:
@@ -216,7 +220,7 @@ def _see_edges_again(merge: Merge) -> None:
         return
     merge.writer.checkpoint()
     graph, edges = merge.graph, merge.centre.load().edges
-    graph.add_edges([one for one in edges if graph.find_edge(one.a, one.b, one.kind) is None])
+    graph.add_edges([edge for edge in edges if graph.find_edge(edge.a, edge.b, edge.kind) is None])
 
 
 def _join_components(merge: Merge) -> None:
@@ -277,7 +281,9 @@ def _keep_words(merge: Merge, descriptor: DescriptorKind) -> None:
     vocabulary, graph = vocabulary_or_default(merge.centre, descriptor), merge.graph
     theirs = NodeWords.of_map(merge.robot, vocabulary)
     robot = merge.robot.graph  # nodes hidden there were not checked
-    brought = {node: one for node, one in theirs.kept.items() if node in graph and node in robot}
+    brought = {
+        node: words for node, words in theirs.kept.items() if node in graph and node in robot
+    }
     if brought:
         merge.centre.put_words(theirs.hash, brought)
     NodeWords.of_map(merge.centre, vocabulary).keep_missing([node.id for node in graph.nodes])

@@ -17,9 +17,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.fleet.merge.merge_settings import MergeOptions, SeedFrom, Unit, localises_well
+from engram.fleet.merge.open_merge import Merge, beyond, recomposed, seen_from, uncertainty_m2
 from engram.fleet.merge.report import KeptNode, Reason, Seed, SegmentReport
-from engram.fleet.merge.settings import MergeOptions, SeedFrom, Unit, localises_well
-from engram.fleet.merge.state import Merge, beyond, recomposed, seen_from, uncertainty_m2
 from engram.frontend.frame import Frame, FrameStatus
 from engram.geometry.se3 import SE3
 from engram.graph.model import (
@@ -86,7 +86,7 @@ class Held:
                 covariance=None,
             )
             self.outcomes = ()
-            self.attempts = [replace(one, accepted=False) for one in self.attempts]
+            self.attempts = [replace(attempt, accepted=False) for attempt in self.attempts]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +164,7 @@ def _steps(known: dict[NodeId, Node], edges: Iterable[Edge]) -> dict[NodeId, tup
             a, b = b, a
         oriented.append((b.stamp_ns - a.stamp_ns, a.id, b.id, edge))
     # Of two opposite edges between the same nodes, the edge's key decides.
-    oriented.sort(key=lambda one: (one[0], one[1], one[2], one[3].a))
+    oriented.sort(key=lambda step: (step[0], step[1], step[2], step[3].a))
     chosen: dict[NodeId, tuple[NodeId, Edge]] = {}
     entered: set[NodeId] = set()
     for _, a_id, b_id, edge in oriented:
@@ -359,9 +359,9 @@ class Replay(Keeper):
 
     def withdrawn(self, found: Localisation) -> None:
         """See `Keeper`: the frame was not localised, nor do those after it have a position."""
-        for one in self._held:
-            if one.found.stamp_ns >= found.stamp_ns:
-                one.withdrawn(is_the_fix=one.found.stamp_ns == found.stamp_ns)
+        for held in self._held:
+            if held.found.stamp_ns >= found.stamp_ns:
+                held.withdrawn(is_the_fix=held.found.stamp_ns == found.stamp_ns)
 
     @property
     def _whole(self) -> bool:
@@ -414,7 +414,7 @@ class Replay(Keeper):
             clock=session,
         )
         if session.id not in self._iterations:
-            made = (one.last_iterations.get(session.id, -1) for one in (robot, centre))
+            made = (store.last_iterations.get(session.id, -1) for store in (robot, centre))
             self._iterations[session.id] = max(made) + _ITERATION_GAP
         localiser.resume(segment.nodes[0].driven_m, self._iterations[session.id])
         return localiser
@@ -474,35 +474,37 @@ class Replay(Keeper):
             before: nodes from this dense index on do not count: those of the current run, which
                 carry no more information than odometry.
         """
-        found = []
+        positions = []
         for edge in self._merge.edges_of(node):
             other = self._merge.equivalent(edge.b if edge.a == node else edge.a)
             if other is None or edge.kind not in kinds:
                 continue
             if before is None or self._merge.graph.index(other.node) < before:
-                found.append(beyond(other, edge, node))
-        return min(found, key=lambda one: uncertainty_m2(one.covariance), default=None)
+                positions.append(beyond(other, edge, node))
+        return min(
+            positions, key=lambda position: uncertainty_m2(position.covariance), default=None
+        )
 
     # -- the outcome of a frame
 
     def _release(self) -> None:
         """Omits or takes the nodes that were held back, in the order of time."""
         held, self._held = self._held, []
-        for one in held:
-            node, found = one.stored.node, one.found
-            self._remember(node, found, one.attempts)
-            reason = self._reason(one.live, found)
+        for pending in held:
+            node, found = pending.stored.node, pending.found
+            self._remember(node, found, pending.attempts)
+            reason = self._reason(pending.live, found)
             if reason is None:
                 # The fleet map covers this place already.
                 assert found.measured is not None
-                self._merge.omit(node.id, found.measured, one.stored.landmark_hash)
+                self._merge.omit(node.id, found.measured, pending.stored.landmark_hash)
                 self._link(node.id)
             else:
-                self._take(one)
-                if one is held[-1]:
+                self._take(pending)
+                if pending is held[-1]:
                     self._localiser.settle_in(node.id)
             if found.localised:
-                self._matched(node, one.outcomes)
+                self._matched(node, pending.outcomes)
             moved_m = found.motion.odometry.moved_m
             self._kept.append(KeptNode(node.stamp_ns, moved_m, reason))
             self._monitor.advance("added" if reason else "covered")

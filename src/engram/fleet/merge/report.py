@@ -100,14 +100,14 @@ class SegmentReport:
     @staticmethod
     def of(session: Session, seed: Seed, nodes: Sequence[KeptNode]) -> SegmentReport:
         """Counts the nodes of a segment, in the order of time; one that matches places it."""
-        if seed is Seed.NONE and any(one.reason in {None, Reason.WEAK_MATCH} for one in nodes):
+        if seed is Seed.NONE and any(node.reason in {None, Reason.WEAK_MATCH} for node in nodes):
             seed = Seed.PLACE
         runs = []
-        for _, some in groupby(nodes, key=lambda one: one.reason is None):
-            run = list(some)
-            reasons = Counter(one.reason for one in run if one.reason is not None)
+        for _, group in groupby(nodes, key=lambda node: node.reason is None):
+            run = list(group)
+            reasons = Counter(node.reason for node in run if node.reason is not None)
             if reasons:
-                length_m = sum(one.moved_m for one in run[1:])
+                length_m = sum(node.moved_m for node in run[1:])
                 reason = max(Reason, key=reasons.__getitem__)
                 runs.append(RunReport(run[0].stamp_ns, len(run), length_m, reason))
         taken = sum(run.nodes for run in runs)
@@ -132,20 +132,23 @@ _SEED_WORDS = {
 def _drive_text(segments: Sequence[SegmentReport]) -> str:
     """One line for all segments of a drive: lost odometry can leave hundreds of single nodes."""
     first = segments[0]
-    taken, omitted = sum(one.taken for one in segments), sum(one.omitted for one in segments)
+    taken, omitted = (
+        sum(segment.taken for segment in segments),
+        sum(segment.omitted for segment in segments),
+    )
     line = f"  {first.robot} {first.session[:8]}: {taken} added, {omitted} already covered"
     if len(segments) > 1:
         line += f", in {len(segments)} segments"
-    seeds = Counter(one.seed for one in segments)
+    seeds = Counter(segment.seed for segment in segments)
     for seed, words in _SEED_WORDS.items():
         if seeds[seed]:
             line += f", {words}" if len(segments) == 1 else f", {seeds[seed]} {words}"
     reasons = Counter[Reason]()
-    for one in segments:
-        for run in one.runs:
+    for segment in segments:
+        for run in segment.runs:
             reasons[run.reason] += run.nodes
-    told = [f"{_WORDS[reason]} ({count})" for reason, count in reasons.most_common()]
-    return f"{line}: {'; '.join(told)}" if told else line
+    parts = [f"{_WORDS[reason]} ({count})" for reason, count in reasons.most_common()]
+    return f"{line}: {'; '.join(parts)}" if parts else line
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +263,7 @@ class MergeReport:
                 f"{counted(self.attempts, 'attempt')} carried over"
             )
             drives = self._drives()
-            lines += [_drive_text(one) for one in drives[:_SHOWN_DRIVES]]
+            lines += [_drive_text(drive) for drive in drives[:_SHOWN_DRIVES]]
             if len(drives) > _SHOWN_DRIVES:
                 lines.append(f"  … and {counted(len(drives) - _SHOWN_DRIVES, 'more drive')}")
         if self.held_out is not None:
@@ -274,10 +277,10 @@ class MergeReport:
         return "\n".join(lines)
 
     def _drives(self) -> list[list[SegmentReport]]:
-        found: dict[str, list[SegmentReport]] = {}
-        for one in self.segments:
-            found.setdefault(one.session, []).append(one)
-        return list(found.values())
+        drives: dict[str, list[SegmentReport]] = {}
+        for segment in self.segments:
+            drives.setdefault(segment.session, []).append(segment)
+        return list(drives.values())
 
     def _outcome(self) -> str:
         if self.interrupted:

@@ -249,16 +249,16 @@ class _Contents:
             self.counts = dict(struct.iter_unpack("<HQ", table[: len(table) // 10 * 10]))
 
     def topics(self, encoding: str) -> dict[str, Topic]:
-        found = {
+        topics = {
             topic.name: topic_of(topic.name, topic.type, self.encodings[number], encoding)
             for number, topic in self.channels.items()
         }
         if self.counts is None:
-            return found
+            return topics
         counts: dict[str, int] = {}
         for number, topic in self.channels.items():
             counts[topic.name] = counts.get(topic.name, 0) + self.counts.get(number, 0)
-        return counted(found, counts)
+        return counted(topics, counts)
 
 
 class McapBag:
@@ -482,7 +482,7 @@ class Ros1Bag:
             for number, count in struct.iter_unpack("<II", data[: len(data) // 8 * 8]):
                 if number in connections:
                     counts[connections[number].name] += count
-        return counted({one.name: one for one in connections.values()}, counts)
+        return counted({connection.name: connection for connection in connections.values()}, counts)
 
     def _scan(
         self,

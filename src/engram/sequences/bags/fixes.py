@@ -49,24 +49,26 @@ def read_fixes(path: Path, topic: str | None = None) -> list[Fix]:
     if topic is None and len(known) != 1:
         raise InputError(f"{path}: name the topic with --topic; {listed}")
     named = topic or known[0]
-    found = {one.time_ns: one for one in fixes_of(bag, named, Decoder(bag.is_ros1))}
-    if not found:
+    fixes = {fix.time_ns: fix for fix in fixes_of(bag, named, Decoder(bag.is_ros1))}
+    if not fixes:
         facts = f"; {bag.lost[0]}" if bag.lost else ""
         raise InputError(f"{path}: {named} holds no fix: every message says so{facts}")
-    return [found[time_ns] for time_ns in sorted(found)]
+    return [fixes[time_ns] for time_ns in sorted(fixes)]
 
 
 def fix_topics(bag: Bag) -> list[str]:
     """Names of the topics with fixes, empty ones left out."""
-    return sorted(one.name for one in bag.topics.values() if one.type == FIX and one.count != 0)
+    return sorted(
+        topic.name for topic in bag.topics.values() if topic.type == FIX and topic.count != 0
+    )
 
 
 def fixes_of(
     bag: Bag, topic: str, decoder: Decoder, clock: SteadyClock | None = None
 ) -> Iterator[Fix]:
     """The fixes of a topic by rising time; messages without a fix are left out."""
-    for one in timed_messages(bag, decoder, topic, clock or SteadyClock(waits=True)):
-        fix = _fix(one.item[0], one.time_ns)
+    for message in timed_messages(bag, decoder, topic, clock or SteadyClock(waits=True)):
+        fix = _fix(message.item[0], message.time_ns)
         if fix is not None:
             yield fix
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from engram.calibration.cameras import Cameras, lens_of, rectified_cameras
+from engram.calibration.calibrated_pair import Cameras, lens_of, rectified_cameras
 from engram.calibration.formats import CameraInfo, cameras_of_infos
 from engram.errors import CalibrationError, InputError, SequenceError
 from engram.geometry.se3 import SE3
@@ -20,7 +20,7 @@ from engram.sequences.bags.containers import Bag, DamageError, Record, needs_bag
 from engram.sequences.bags.topics import StereoTopics, info_topics
 from engram.sequences.calibrating import scaled_by
 from engram.sequences.clocks import SteadyClock, Timed, in_time
-from engram.sequences.motion import FORWARD, RigMotion, Sample, read_samples
+from engram.sequences.motion_files import FORWARD, RigMotion, Sample, read_samples
 
 _TF = "tf2_msgs/msg/TFMessage"
 # Messages of which one has a stamp, if a topic has any.
@@ -104,9 +104,9 @@ def timed_messages(
     stamps = Stamps(bag, decoder, topic)
     return in_time(
         messages(bag, decoder, topic),
-        lambda one: stamps.of(*one),
+        lambda received: stamps.of(*received),
         clock,
-        lambda one: one[1].received_ns,
+        lambda received: received[1].received_ns,
     )
 
 
@@ -214,7 +214,7 @@ def with_constant(static: Transforms, bag: Bag, decoder: Decoder, frame: str) ->
             moved = before.inverse() @ pose
             if above != parent or moved.distance_m > _STILL_M or moved.angle_rad > _STILL_RAD:
                 moving.add(child)
-    constant = {child: one for child, one in first.items() if child not in moving}
+    constant = {child: parent for child, parent in first.items() if child not in moving}
     return Transforms({**constant, **static.parents}, moving - static.parents.keys())
 
 
@@ -230,12 +230,12 @@ def _named(bag: Bag, ending: str) -> list[str]:
 def _poses(bag: Bag, decoder: Decoder, topic: str, most: int) -> Iterator[tuple[str, str, SE3]]:
     """Child, parent and parent_from_child of the transforms in the first messages of a topic."""
     for message in islice(_messages(bag, decoder, topic, _TF), most):
-        for one in message.transforms:
-            pose = _pose_of_transform(one.transform)
+        for transform in message.transforms:
+            pose = _pose_of_transform(transform.transform)
             if pose is None:
-                bag.note(f"{topic}: {one.child_frame_id[:60]!r} has no valid rotation")
+                bag.note(f"{topic}: {transform.child_frame_id[:60]!r} has no valid rotation")
                 continue
-            yield one.child_frame_id.lstrip("/"), one.header.frame_id.lstrip("/"), pose
+            yield transform.child_frame_id.lstrip("/"), transform.header.frame_id.lstrip("/"), pose
 
 
 def _pose_of_transform(transform: Any) -> SE3 | None:
@@ -257,19 +257,19 @@ def read_infos(
     Args:
         size: of the images, px; None if unknown.
     """
-    topics = [name for name, one in bag.topics.items() if same_type(one.type) == _INFO]
+    topics = [name for name, topic in bag.topics.items() if same_type(topic.type) == _INFO]
     named = info_topics(stereo, topics)
-    found = topics if named is None else [named.left, named.right]
-    if len(found) != 2:
+    chosen = topics if named is None else [named.left, named.right]
+    if len(chosen) != 2:
         return None
     infos = []
-    for topic in found:
+    for topic in chosen:
         message = next(_messages(bag, decoder, topic, _INFO), None)
         if message is None:
             return None
         infos.append(_info(topic, message, size, rectified=stereo.are_rectified))
     if named is None:
-        infos.sort(key=lambda one: -one.p[0, 3])
+        infos.sort(key=lambda info: -info.p[0, 3])
     left, right = infos
     return left, right
 
@@ -314,7 +314,7 @@ def read_cameras(
         )
     infos = read_infos(bag, decoder, stereo, size)
     if infos is None:
-        others = [name for name, one in bag.topics.items() if same_type(one.type) == _INFO]
+        others = [name for name, topic in bag.topics.items() if same_type(topic.type) == _INFO]
         also = f" (those of {', '.join(others)} belong to other topics)" if others else ""
         raise CalibrationError(
             f"{bag.path}: has no CameraInfo for {stereo.left} and {stereo.right}{also}; give the "
@@ -353,16 +353,16 @@ def _right_from_left(
 ) -> SE3 | None:
     """Pose of the left camera in the right one by the bag's transforms; None without one."""
     if left.frame != right.frame:
-        found = transforms.between(right.frame, left.frame)
-        if found is not None:
-            return _optical(found, left.frame, right.frame)
-    poses = [_stream_pose(bag, decoder, one) for one in (stereo.left, stereo.right)]
+        right_from_left = transforms.between(right.frame, left.frame)
+        if right_from_left is not None:
+            return _optical(right_from_left, left.frame, right.frame)
+    poses = [_stream_pose(bag, decoder, topic) for topic in (stereo.left, stereo.right)]
     if poses[0] is None or poses[1] is None:
         return None
     # Of the two readings of such a pose, that by which the first camera is the left one.
-    found = poses[1] @ poses[0].inverse()
+    right_from_left = poses[1] @ poses[0].inverse()
     other = poses[1].inverse() @ poses[0]
-    return found if found.translation[0] < other.translation[0] else other
+    return right_from_left if right_from_left.translation[0] < other.translation[0] else other
 
 
 def _optical(right_from_left: SE3, *frames: str) -> SE3:
@@ -397,7 +397,7 @@ def _info(topic: str, message: Any, size: tuple[int, int] | None, *, rectified: 
     names = ("d", "k", "r", "p") if hasattr(message, "k") else ("D", "K", "R", "P")
     d, k, r, p = (np.asarray(getattr(message, name), dtype=np.float64) for name in names)
     try:
-        if not all(np.isfinite(one).all() for one in (d, k, r, p)):
+        if not all(np.isfinite(matrix).all() for matrix in (d, k, r, p)):
             raise CalibrationError("has a number that is not finite")
         # The lens of rectified images has no part in them.
         model = "none" if rectified and p[0] > 0 else message.distortion_model
@@ -446,7 +446,7 @@ def _counted(d: Any, counts: set[int]) -> list[float]:
         wanted = " or ".join(map(str, sorted(counts)))
         raise CalibrationError(f"D has {len(d)} coefficients, must be {wanted}")
     padded = np.pad(used, (0, fitting[0] - len(used)))
-    return [float(one) for one in padded]
+    return [float(value) for value in padded]
 
 
 ODOMETRY, TWIST, IMU = (
@@ -489,7 +489,7 @@ class BagMotion:
     @property
     def files(self) -> tuple[str, ...]:
         """Files that it reads in addition to the bag."""
-        return tuple(one for one in self._sources.values() if one not in self._bag.topics)
+        return tuple(source for source in self._sources.values() if source not in self._bag.topics)
 
     def source(self, shift_ns: int) -> RigMotion | None:
         """A new pass through the motion; None without one."""
@@ -508,7 +508,9 @@ class BagMotion:
         if topic is None and Path(name).is_file():
             return read_samples(Path(name))[0].velocity_m_s is None
         known = [
-            one.name for one in self._bag.topics.values() if one.type in {ODOMETRY, TWIST, IMU}
+            topic.name
+            for topic in self._bag.topics.values()
+            if topic.type in {ODOMETRY, TWIST, IMU}
         ]
         what = (
             f"holds {topic.type}"
@@ -543,8 +545,8 @@ class BagMotion:
             return
         clock = self.clocks[name] = SteadyClock(waits=True)
         last_ns, last_pose = 0, None
-        for one in timed_messages(self._bag, self._decoder, name, clock):
-            message, stamp_ns = one.item[0], one.time_ns
+        for timed in timed_messages(self._bag, self._decoder, name, clock):
+            message, stamp_ns = timed.item[0], timed.time_ns
             if topic.type == IMU:
                 sample = Sample(stamp_ns, None, _vector(message.angular_velocity))
             else:
@@ -557,8 +559,8 @@ class BagMotion:
                     sample = _between(last_pose, last_ns, pose, stamp_ns)
                 last_pose = pose
             last_ns = stamp_ns
-            way = 0.0 if sample.velocity_m_s is None else sample.velocity_m_s
-            if np.isfinite(np.r_[way, sample.rates_rad_s]).all():
+            speed_m_s = 0.0 if sample.velocity_m_s is None else sample.velocity_m_s
+            if np.isfinite(np.r_[speed_m_s, sample.rates_rad_s]).all():
                 yield sample
             else:  # not a robot at rest: nothing was measured
                 self._bag.note(f"{name}: a measurement is not finite; left out")

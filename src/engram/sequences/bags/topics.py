@@ -265,7 +265,9 @@ def image_topics(topics: Mapping[str, Topic]) -> list[str]:
 def same_images(name: str, topics: Mapping[str, Topic]) -> str | None:
     """The topic of these images, as compressed or not as the bag has them; None if it has not."""
     bare = "/" + name.strip("/").removesuffix(_COMPRESSED)
-    return next((one for one in (name, bare, bare + _COMPRESSED) if one in topics), None)
+    return next(
+        (spelling for spelling in (name, bare, bare + _COMPRESSED) if spelling in topics), None
+    )
 
 
 def stereo_topics(
@@ -347,21 +349,21 @@ def _pairs(images: Collection[str]) -> Iterator[StereoTopics]:
 def partners(name: str) -> Iterator[str]:
     """The names that the right camera's topic may have, given that of the left camera."""
     for pattern, right in _PATTERNS:
-        found = list(pattern.finditer(name))
-        if found:
+        words = list(pattern.finditer(name))
+        if words:
             yield pattern.sub(partial(_exchanged, right), name)
-        for one in found if len(found) > 1 else ():  # as /left_arm/camera/left/image
-            yield name[: one.start()] + _exchanged(right, one) + name[one.end() :]
+        for word in words if len(words) > 1 else ():  # as /left_arm/camera/left/image
+            yield name[: word.start()] + _exchanged(right, word) + name[word.end() :]
 
 
 def _place(name: str) -> int:
     """Where the word for the side stands."""
-    return next(found.start(2) for pattern, _ in _PATTERNS if (found := pattern.search(name)))
+    return next(match.start(2) for pattern, _ in _PATTERNS if (match := pattern.search(name)))
 
 
-def _exchanged(right: str, found: re.Match[str]) -> str:
+def _exchanged(right: str, word: re.Match[str]) -> str:
     """The right camera's word for the left one's, in its case."""
-    before, left = found.groups()
+    before, left = word.groups()
     if left.isupper():
         return before + right.upper()
     return before + (right.capitalize() if left[:1].isupper() else right)
@@ -395,13 +397,13 @@ def info_topics(stereo: StereoTopics, infos: Collection[str]) -> StereoTopics | 
         return StereoTopics(str(beside[0]), str(beside[1]))
     pairs = list(_pairs(infos))
     if list(_pairs([stereo.left, stereo.right])) == [stereo.exchanged()]:
-        pairs = [one.exchanged() for one in pairs]
-    return max(pairs, key=lambda one: _shared(one.left, stereo.left), default=None)
+        pairs = [pair.exchanged() for pair in pairs]
+    return max(pairs, key=lambda pair: _shared(pair.left, stereo.left), default=None)
 
 
-def _shared(one: str, other: str) -> int:
-    pairs = enumerate(zip(one, other, strict=False))
-    return next((at for at, (a, b) in pairs if a != b), min(len(one), len(other)))
+def _shared(name: str, other: str) -> int:
+    pairs = enumerate(zip(name, other, strict=False))
+    return next((at for at, (a, b) in pairs if a != b), min(len(name), len(other)))
 
 
 def _info_beside(image: str, infos: Collection[str]) -> str | None:

@@ -29,7 +29,7 @@ from engram.sequences.framelog.file import (
     log_table,
 )
 from engram.sequences.layouts import with_options
-from engram.sequences.motion import motion_of_files
+from engram.sequences.motion_files import motion_of_files
 from engram.sequences.sequence import Channel, LoggedFrame, OpenOptions, SequenceInfo
 
 SUFFIX = ".framelog"

@@ -13,8 +13,8 @@ import numpy as np
 
 from engram.errors import ConfigError
 from engram.fleet.dream import DreamOptions, dream, localised_in
+from engram.fleet.merge.merge_settings import MergeOptions
 from engram.fleet.merge.merging import merge
-from engram.fleet.merge.settings import MergeOptions
 from engram.frontend.frame import StereoPair
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3

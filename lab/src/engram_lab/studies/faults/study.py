@@ -34,7 +34,7 @@ from engram.monitor import QUIET, Monitor
 from engram.robot.mapping import Beginning, map_drive
 from engram.robot.robot import Seen
 from engram.robot.settings import RobotOptions, Settings
-from engram.sequences.motion import Trajectory
+from engram.sequences.motion_files import Trajectory
 from engram.sequences.opening import open_drive
 from engram_lab.accuracy import Fix, events, way_m
 from engram_lab.studies.building import edge_errors

@@ -13,7 +13,7 @@ import numpy as np
 from engram.cli.settings import AllSettings
 from engram.config import to_dict
 from engram.errors import ConfigError
-from engram.fleet.merge.settings import NO_RELOCALISER, MergeOptions
+from engram.fleet.merge.merge_settings import NO_RELOCALISER, MergeOptions
 from engram.measures import Drive
 from engram.robot.settings import RobotOptions, Settings
 from engram_lab.studies.building import write_json

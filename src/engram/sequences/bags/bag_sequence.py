@@ -13,7 +13,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.calibration.cameras import Cameras
+from engram.calibration.calibrated_pair import Cameras
 from engram.calibration.formats import read_calibration
 from engram.counts import counted
 from engram.errors import CalibrationError, InputError, SequenceError
@@ -51,7 +51,7 @@ from engram.sequences.calibrating import TELLING, check_no_view, check_sides, re
 from engram.sequences.clocks import StampReport, SteadyClock, Timed, in_time, joined
 from engram.sequences.layouts import YEAR_2000_NS, Side, half, rectified, with_options
 from engram.sequences.listing import paired
-from engram.sequences.motion import stamp_facts_of_files
+from engram.sequences.motion_files import stamp_facts_of_files
 from engram.sequences.sequence import OpenOptions, SequenceInfo
 
 T = TypeVar("T")
@@ -151,7 +151,7 @@ def pairs_of(
     Both topics are read side by side, so that memory stays flat whatever the order of the bag.
     """
     timed = [
-        in_time(shots, lambda one: one.stamp_ns, clock, lambda one: one.received_ns)
+        in_time(shots, lambda shot: shot.stamp_ns, clock, lambda shot: shot.received_ns)
         for shots, clock in zip((left, right), pairing.clocks, strict=True)
     ]
     for shot, other in paired(timed[0], timed[1], pairing.tolerance_ns):
@@ -241,8 +241,8 @@ class BagSequence:
         if len(names) != 1:
             return None
         clock = self._fix_clocks[names[0]] = SteadyClock(waits=True)
-        found = fixes_of(self._bag, names[0], self._decoder, clock)
-        return (replace(one, time_ns=one.time_ns + self._shift_ns) for one in found)
+        fixes = fixes_of(self._bag, names[0], self._decoder, clock)
+        return (replace(fix, time_ns=fix.time_ns + self._shift_ns) for fix in fixes)
 
     @property
     def frame(self) -> str:
@@ -411,12 +411,12 @@ class BagSequence:
         for topic in (self.topics.right, self.topics.left):
             why: list[str] = []
             shots = islice(self._shots(topic, why.append), _LEARNT_FROM)
-            timed = list(in_time(shots, lambda one: one.stamp_ns, SteadyClock(waits=True)))
+            timed = list(in_time(shots, lambda shot: shot.stamp_ns, SteadyClock(waits=True)))
             if not timed:
-                lost = "".join(f"; {one}" for one in self._bag.lost[:1])
+                lost = "".join(f"; {fault}" for fault in self._bag.lost[:1])
                 fault = why[0] if why else f"{topic}: no image can be read"
                 raise SequenceError(f"{self._bag.path}: {fault}{lost}")
-            stamps.append([one.stamp_ns for one in timed])
+            stamps.append([shot.stamp_ns for shot in timed])
             first_ns = timed[0].time_ns
         try:
             most_ns = self._options.pair_tolerance_ns
@@ -446,7 +446,7 @@ class BagSequence:
                 alone = False
         try:
             raw = given is not None and given.rectification is not None
-            found = stereo_topics(self._bag.topics, left, right, prefer_raw=raw)
+            topics = stereo_topics(self._bag.topics, left, right, prefer_raw=raw)
         except SequenceError as error:
             only = only_topic(self._bag.topics) if alone else None
             size = (0, 0) if only is None else self._first_size(only)
@@ -454,9 +454,9 @@ class BagSequence:
                 return StereoTopics(only, only)
             advice = "" if size[0] < 2 * size[1] or only is None else _as_halves(only, size)
             raise SequenceError(f"{self._bag.path}: {error}{advice}") from error
-        if alone and given is not None and given.right_first and found.are_numbered:
-            return found.exchanged()  # cam0 is the calibration's cam0
-        return found
+        if alone and given is not None and given.right_first and topics.are_numbered:
+            return topics.exchanged()  # cam0 is the calibration's cam0
+        return topics
 
     def _given(self, options: OpenOptions, *, rectified: bool = False) -> Cameras:
         assert options.calibration is not None
@@ -614,7 +614,11 @@ def _topics(bag: Bag) -> tuple[list[TopicFacts], int, int]:
     for name, found in sorted(stamps.items()):
         intervals_ns = np.array([after - before for before, after in pairwise(sorted(found))])
         usual_ns = float(np.median(intervals_ns)) if len(intervals_ns) else 0.0
-        gaps_ns = [one for one in intervals_ns.tolist() if one > _GAP_RATIO * max(usual_ns, 1.0)]
+        gaps_ns = [
+            interval_ns
+            for interval_ns in intervals_ns.tolist()
+            if interval_ns > _GAP_RATIO * max(usual_ns, 1.0)
+        ]
         facts.append(
             TopicFacts(
                 name,
@@ -637,7 +641,7 @@ def _stamps(bag: Bag, drive: BagSequence | None) -> tuple[list[str], float]:
         share = drive.read_stamps().faulty_share
         facts += drive.stamp_facts
     decoder = Decoder(bag.is_ros1)
-    for topic in sorted(bag.topics.values(), key=lambda one: one.name):
+    for topic in sorted(bag.topics.values(), key=lambda topic: topic.name):
         if topic.type in {ODOMETRY, TWIST, IMU, FIX}:
             facts += clock_of(bag, decoder, topic.name).report.texts(f"message of {topic.name}")
     return facts, share

@@ -114,14 +114,14 @@ class FrameLogWriter:
         if self._last_stamp_ns is None or stamp_ns > self._last_stamp_ns:
             return False
         with self._or_abandon() as connection:
-            found = connection.execute(
+            stored = connection.execute(
                 select(frames_table.c.pair_hash)
                 .where(frames_table.c.stamp_ns == stamp_ns)
                 .order_by(frames_table.c.number)
             ).scalar()
-        if found != pair_hash:
+        if stored != pair_hash:
             raise IncompatibleError(
-                f"{self._path}: holds {'other images' if found else 'no frame'} at {stamp_ns} ns: "
+                f"{self._path}: holds {'other images' if stored else 'no frame'} at {stamp_ns} ns: "
                 "it is the log of another drive, rig, channel or choice of frames; choose another "
                 "file or remove it"
             )
@@ -279,9 +279,9 @@ def read_decisions(path: Path) -> dict[int, dict[str, Any]]:
     """What the robot concluded from each frame, by its number; see `read_report` for errors."""
     with _reading(path) as connection:
         rows = connection.execute(select(decisions_table).order_by(decisions_table.c.number))
-        found = {row.number: _json(path, row) for row in rows}
-        _check_count(path, len(found), _report(path, connection), _FRAMES)
-        return found
+        decisions = {row.number: _json(path, row) for row in rows}
+        _check_count(path, len(decisions), _report(path, connection), _FRAMES)
+        return decisions
 
 
 def read_images(path: Path, number: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]] | None:
@@ -298,12 +298,12 @@ def read_images(path: Path, number: int) -> tuple[NDArray[np.uint8], NDArray[np.
             raise MapCorruptError(f"{path}: the images of frame {number} are not found")
         return None
     sides = (row.left_image, row.right_image)
-    if not all(isinstance(one, bytes) for one in sides) or content_digest(b"".join(sides)) != (
+    if not all(isinstance(side, bytes) for side in sides) or content_digest(b"".join(sides)) != (
         row.digest
     ):
         raise MapCorruptError(f"{path}: the images of frame {number} do not match their hash")
     size = (header.camera.width, header.camera.height)
-    left, right = (_decoded(path, one, size) for one in sides)
+    left, right = (_decoded(path, side, size) for side in sides)
     return left, right
 
 

@@ -134,7 +134,9 @@ class Merge:
         self.centre = centre
         self.graph = centre.graph
         self.robot = robot
-        self.sessions = sorted(robot.sessions.values(), key=lambda one: (one.start_ns, one.id))
+        self.sessions = sorted(
+            robot.sessions.values(), key=lambda session: (session.start_ns, session.id)
+        )
         self.edges = sorted(robot.graph.edges, key=_edge_key)
         self.report = MergeReport.of(robot)
         self._omitted = {
@@ -202,10 +204,10 @@ class Merge:
 
     def new_removals(self) -> Iterator[Removal]:
         """The robot's removals between nodes of the fleet map that it has never had."""
-        for one in self.robot.removals:
-            known = one.a in self.graph and one.b in self.graph
-            if known and one.key not in self.centre.seen_removals:
-                yield one
+        for removal in self.robot.removals:
+            known = removal.a in self.graph and removal.b in self.graph
+            if known and removal.key not in self.centre.seen_removals:
+                yield removal
 
     def new_goals(self) -> Iterator[Goal]:
         """The robot's goals at known nodes, under names that are new to the fleet map.
@@ -216,9 +218,9 @@ class Merge:
             position = self.equivalent(goal.node)
             if position is not None and goal.name not in self.centre.goals:
                 node_from_goal = position.node_from_live @ goal.node_from_goal
-                found = Goal(goal.name, position.node, node_from_goal)
-                if not had_goal(self.centre, found):
-                    yield found
+                moved = Goal(goal.name, position.node, node_from_goal)
+                if not had_goal(self.centre, moved):
+                    yield moved
 
     def lacks_omission(self, omitted: NodeId) -> Position | None:
         """Position of a node that the robot's map omitted; None if the fleet map contains it."""
@@ -245,7 +247,10 @@ class Merge:
         if _key(new) in self._known_entries(entry.path):
             return None
         if entry.kind is PathEntryKind.REPLAYED:
-            last = [one.sequence + 1 for one in self.centre.path_memory.entries(entry.path)[-1:]]
+            last = [
+                previous.sequence + 1
+                for previous in self.centre.path_memory.entries(entry.path)[-1:]
+            ]
             return replace(new, sequence=max([FIRST_REPLAYED, *last]))
         return new
 
@@ -268,7 +273,9 @@ class Merge:
             place.setdefault(session, len(place))
         named = np.array([place[session] for session in self.robot.sessions], np.int32)
         new = made.rows(replace(made, session=named[made.session]).lacking(remembered))
-        return new.moved_to([None if one is None else one.node_from_live for one in positions])
+        return new.moved_to(
+            [None if position is None else position.node_from_live for position in positions]
+        )
 
     # -- additions to the fleet map
 
@@ -384,7 +391,7 @@ def _same_record(merge: Merge, node: NodeId) -> bool:
     if not all(node in graph for graph in graphs):
         return True
     records = (graph.node(graph.index(node)) for graph in graphs)
-    ours, theirs = ((one.session, one.stamp_ns, one.camera) for one in records)
+    ours, theirs = ((record.session, record.stamp_ns, record.camera) for record in records)
     return ours == theirs
 
 
@@ -403,24 +410,24 @@ def notes(merge: Merge, now_ns: int) -> list[str]:
         now_ns: the time, UTC.
     """
     robot = merge.robot
-    found = [
-        f"session {one.session.id} of {one.session.robot} was interrupted in {robot.location}: it "
-        "is not merged before it is resumed or sealed there"
-        for one in robot.interrupted()
+    warnings = [
+        f"session {drive.session.id} of {drive.session.robot} was interrupted in "
+        f"{robot.location}: it is not merged before it is resumed or sealed there"
+        for drive in robot.interrupted()
     ]
-    new = [one for one in merge.sessions if one.id not in merge.centre.sessions]
+    new = [session for session in merge.sessions if session.id not in merge.centre.sessions]
     saved: dict[SessionId, list[Node]] = defaultdict(list)
-    for node in sorted(robot.graph.nodes, key=lambda one: (one.stamp_ns, one.id)):
+    for node in sorted(robot.graph.nodes, key=lambda node: (node.stamp_ns, node.id)):
         saved[node.session].append(node)
     for session in new:
-        found += _backwards(session, saved[session.id])
+        warnings += _backwards(session, saved[session.id])
         if session.clock is Clock.UTC and session.begin_ns > now_ns:
-            found.append(
+            warnings.append(
                 f"session {session.id} of {session.robot} begins "
                 f"{(session.begin_ns - now_ns) / _NS_PER_S / 3600:.1f} hours from now: its clock "
                 "was wrong"
             )
-    return found + list(_overlaps(merge, new))
+    return warnings + list(_overlaps(merge, new))
 
 
 def _backwards(session: Session, nodes: list[Node]) -> Iterator[str]:
@@ -431,7 +438,7 @@ def _backwards(session: Session, nodes: list[Node]) -> Iterator[str]:
         if after.driven_m < before.driven_m - _DRIVEN_SLACK_M
     ]
     if back:
-        _, before, after = max(back, key=lambda one: one[0])
+        _, before, after = max(back, key=lambda step: step[0])
         yield (
             f"the clock of session {session.id} ({session.robot}) runs backwards "
             f"{counted(len(back), 'time')}: "
@@ -446,11 +453,11 @@ def _overlaps(merge: Merge, new: Sequence[Session]) -> Iterator[str]:
     spans = _spans(merge)
     ids = {session.id for session in new}
     for name in sorted({session.robot for session in new}):
-        pairs = list(overlapping([one for one in spans if one.session.robot == name], ids))
-        for one, other in pairs[:_NAMED_OVERLAPS]:
+        pairs = list(overlapping([span for span in spans if span.session.robot == name], ids))
+        for first, other in pairs[:_NAMED_OVERLAPS]:
             yield (
-                f"sessions {one.id} and {other.id} are both of a robot named {name!r} and overlap "
-                "in time: two robots have the same name, or a clock was wrong"
+                f"sessions {first.id} and {other.id} are both of a robot named {name!r} and "
+                "overlap in time: two robots have the same name, or a clock was wrong"
             )
         if len(pairs) > _NAMED_OVERLAPS:
             more = counted(len(pairs) - _NAMED_OVERLAPS, "more pair")
@@ -474,21 +481,21 @@ def overlapping(
     One sweep over the starts that keeps only sessions that have not ended.
     """
     running: list[Span] = []
-    for span in sorted(spans, key=lambda one: (one.first_ns, one.session.id)):
-        running = [one for one in running if one.last_ns >= span.first_ns]
-        for one in running:
-            if span.session.id in new or one.session.id in new:
-                yield one.session, span.session
+    for span in sorted(spans, key=lambda span: (span.first_ns, span.session.id)):
+        running = [earlier for earlier in running if earlier.last_ns >= span.first_ns]
+        for earlier in running:
+            if span.session.id in new or earlier.session.id in new:
+                yield earlier.session, span.session
         running.append(span)
 
 
 def _spans(merge: Merge) -> list[Span]:
     sessions = {**merge.centre.sessions, **merge.robot.sessions}
-    last = {one.id: one.start_ns for one in sessions.values()}
+    last = {session.id: session.start_ns for session in sessions.values()}
     for node in (*merge.graph.nodes, *merge.robot.graph.nodes):
         last[node.session] = max(last[node.session], node.stamp_ns)
     return [
-        Span(one, one.begin_ns, last[one.id] + one.shift_ns)
-        for one in sessions.values()
-        if one.clock is Clock.UTC
+        Span(session, session.begin_ns, last[session.id] + session.shift_ns)
+        for session in sessions.values()
+        if session.clock is Clock.UTC
     ]

@@ -207,10 +207,10 @@ class RigMotion:
         while at_ns < end_ns:
             wheels = None if self._wheels is None else self._wheels.at(at_ns)
             gyro = None if self._gyro is None else self._gyro.at(at_ns)
-            held = [one for one in (wheels, gyro) if one is not None]
+            held = [stream for stream in (wheels, gyro) if stream is not None]
             if len(held) < (self._wheels is not None) + (self._gyro is not None):
                 return None
-            until_ns = min([end_ns, *(one.stamp_ns for one in held)])
+            until_ns = min([end_ns, *(sample.stamp_ns for sample in held)])
             step_s, at_ns = (until_ns - at_ns) / 1e9, until_ns
             velocity = np.zeros(3)
             if wheels is not None and wheels.velocity_m_s is not None:
@@ -298,8 +298,8 @@ def timed_samples(path: Path) -> tuple[list[Sample], StampReport]:
     """The samples of a file by rising time, and the report on their stamps."""
     clock = SteadyClock(waits=True)
     if path.suffix.lower() == ".csv":
-        timed = in_time(_csv_samples(path), lambda one: one.stamp_ns, clock)
-        samples = [replace(one.item, stamp_ns=one.time_ns) for one in timed]
+        timed = in_time(_csv_samples(path), lambda sample: sample.stamp_ns, clock)
+        samples = [replace(sample.item, stamp_ns=sample.time_ns) for sample in timed]
     else:
         samples = _pose_samples(path, clock)
     report = clock.report
@@ -314,7 +314,7 @@ def timed_samples(path: Path) -> tuple[list[Sample], StampReport]:
 def _pose_samples(path: Path, clock: SteadyClock) -> list[Sample]:
     """Speeds between the poses of a TUM file: the rig's, in the frame where it began."""
     samples = []
-    for before, after in pairwise(in_time(read_poses(path), lambda one: one[0], clock)):
+    for before, after in pairwise(in_time(read_poses(path), lambda pose: pose[0], clock)):
         step = before.item[1].inverse() @ after.item[1]
         twist = step.log() / ((after.time_ns - before.time_ns) / 1e9)
         samples.append(Sample(after.time_ns, twist[:3], twist[3:]))

@@ -140,7 +140,7 @@ def _characters(value: Any, known: dict[int, int]) -> int:
     if length < 0:
         known[id(value)] = 0
         parts = [*value, *value.values()] if isinstance(value, dict) else value
-        length = known[id(value)] = 1 + sum(_characters(one, known) for one in parts)
+        length = known[id(value)] = 1 + sum(_characters(part, known) for part in parts)
     return length
 
 
@@ -157,17 +157,17 @@ def numbers(entries: dict[str, Any], name: str, counts: set[int]) -> list[float]
     if isinstance(values, dict):
         values = entry(values, "data")
     if isinstance(values, list) and values and isinstance(values[0], list):
-        values = [one for row in values if isinstance(row, list) for one in row]
+        values = [value for row in values if isinstance(row, list) for value in row]
     if not isinstance(values, list) or len(values) not in counts:
         wanted = " or ".join(map(str, sorted(counts)))
         raise CalibrationError(f"{name} must be a list of {wanted} numbers")
     try:
-        found = [float(value) for value in values]
+        floats = [float(value) for value in values]
     except (TypeError, ValueError):
         raise CalibrationError(f"{name} has an entry that is not a number") from None
-    if not all(map(math.isfinite, found)):
+    if not all(map(math.isfinite, floats)):
         raise CalibrationError(f"{name} has a number that is not finite")
-    return found
+    return floats
 
 
 def whole(value: float, name: str = "resolution") -> int:
@@ -240,12 +240,12 @@ def coefficients(
     fisheye = model is DistortionModel.EQUIDISTANT
     used = 4 if fisheye else 8
     # Drivers fill up with zeros: OpenCV's thin prisms and tilts, and Brown's k3 of a fisheye.
-    found = values({4, 5, 8} if fisheye else {4, 5, 8, 12, 14})
-    if any(found[used:]):
+    stated = values({4, 5, 8} if fisheye else {4, 5, 8, 12, 14})
+    if any(stated[used:]):
         more = "more than 4 coefficients" if fisheye else "thin-prism or tilt terms"
         raise CalibrationError(
             f"the lens has {more}, which are not supported; calibrate again without them"
         )
-    if not fisheye and not any(found):
+    if not fisheye and not any(stated):
         return DistortionModel.NONE, ()
-    return model, tuple(found[:used])
+    return model, tuple(stated[:used])

@@ -39,8 +39,8 @@ def localises_well(robot: Robot, frames: Iterable[LoggedFrame], least_share: flo
         robot: placed at the segment's start, if that is known.
         least_share: share of the frames that must localise, in [0, 1].
     """
-    found = [robot.step(logged).localised for logged in frames]
-    return sum(found) >= least_share * len(found)
+    localised = [robot.step(logged).localised for logged in frames]
+    return sum(localised) >= least_share * len(localised)
 
 
 NO_RELOCALISER = "none"
@@ -108,5 +108,5 @@ class MergeOptions(MergeSettings):
     @classmethod
     def of(cls, settings: MergeSettings, author: str | None = None) -> MergeOptions:
         """These settings, with the author of the merge."""
-        values = {one.name: getattr(settings, one.name) for one in fields(MergeSettings)}
+        values = {field.name: getattr(settings, field.name) for field in fields(MergeSettings)}
         return cls(**values, author=author)
