@@ -11,13 +11,13 @@ import numpy as np
 from tests.synthetic_world import Seen
 
 from engram.geometry.se3 import SE3
-from engram.graph.model import Clock, NodeId, Session, session_id
+from engram.graph.model import Clock, NodeId, Session, path_id, session_id
 from engram.localiser.localisation import Budget, Localisation
 from engram.localiser.localiser import Localiser
-from engram.mapper.mapper import Mapper, NodeSaver, Saver
+from engram.mapper.mapper import Mapper, Saver
 from engram.maps.map import Map, open_map
+from engram.robot.drive_session import RevisionSink, loop_search
 from engram.robot.front import Front
-from engram.robot.live import loop_search
 from engram.robot.localisers import localiser_in
 from engram.robot.robot import Robot
 from engram.robot.settings import Settings
@@ -79,7 +79,8 @@ def map_simulated(
             author=name,
             configuration={},
         )
-        saver = Saver(writer, NodeSaver(writer, opened.frames))
+        sink = RevisionSink(writer, opened.frames, None, settings.placing)
+        saver = Saver(sink, path_id(session.id))
         localiser = localiser_in(
             opened,
             first.camera,
@@ -89,10 +90,8 @@ def map_simulated(
             live=session.id,
             saves=True,
         )
-        searching = nullcontext()
-        if closes_loops:
-            searching = loop_search(opened, localiser, settings)
-        with localiser, searching as loops:
+        loops = loop_search(opened, localiser, settings) if closes_loops else None
+        with localiser, loops or nullcontext():
             mapper = Mapper(opened.graph, localiser, saver, session, settings.mapper, loops)
             robot = Robot(Front(settings), localiser, mapper)
             steps = [robot.step(seen.logged) for seen in drive]

@@ -13,13 +13,13 @@ from tests.worlds import forward, make_edge
 
 from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
-from engram.graph.model import EdgeKind, PathEntryKind, path_id
+from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, path_id
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
 from engram.localiser.acceptance import AcceptanceConfig
 from engram.localiser.localisation import Position
 from engram.localiser.tracking import MOST_ON_TRIAL, FixChain
 from engram.mapper.loops import LoopSearch
-from engram.mapper.mapper import Memory, Records
+from engram.mapper.mapper import Memory, Records, Saver
 from engram.testing.contracts import make_node
 
 CHAIN = 20
@@ -93,15 +93,14 @@ def test_a_robot_that_stands_on_a_weak_match_keeps_no_more_than_may_be_withdrawn
 
 
 def test_frames_beyond_those_that_may_be_withdrawn_are_saved() -> None:
-    put: list[Records] = []
-    saver = SimpleNamespace(put=put.append, hold=lambda records: None)
-    localiser = SimpleNamespace(on_trial=True, attempts=list)
-    memory = Memory(localiser, saver, path_id(make_node(0, 0).session))
+    written: list[PathEntry | None] = []
+    sink = SimpleNamespace(add=lambda _, entry: written.append(entry), checkpoint=lambda: None)
+    saver = Saver(sink, path_id(make_node(0, 0).session))
     for index in range(1_000):
-        live = SimpleNamespace(stamp_ns=index)
         visit = make_node(0, index).id, PathEntryKind.MATCHED
-        memory._put(live, Records(), visit)
-    assert len(put) == 1_000 - MOST_ON_TRIAL
-    assert len(memory._held) == MOST_ON_TRIAL
-    memory.finish()
-    assert [one.path_entries[0].sequence for one in put] == list(range(1_000))
+        saver.put(Records(index, visit=visit), MOST_ON_TRIAL)
+    assert len(saver._held) == MOST_ON_TRIAL
+    Memory(SimpleNamespace(), saver).finish()
+    assert not saver._held
+    saver.finish()
+    assert [entry.sequence for entry in written] == list(range(1_000))

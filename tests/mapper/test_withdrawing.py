@@ -19,9 +19,10 @@ from engram.localiser.acceptance import Prediction, Spread
 from engram.localiser.attempts import FrameMatcher
 from engram.localiser.localisation import Position
 from engram.localiser.localiser import Localiser
-from engram.mapper.mapper import Mapper, Memory, NodeSaver, Saver
+from engram.mapper.mapper import Mapper, Memory, Records, Saver
 from engram.maps.map import Map
 from engram.maps.writer import RevisionWriter
+from engram.robot.drive_session import RevisionSink
 from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
 from engram.robot.robot import Robot
@@ -63,11 +64,9 @@ class Notes:
         self.entries: list[PathEntry] = []
         self.attempts: list[Attempt] = []
 
-    def add_path_entry(self, entry: PathEntry) -> None:
-        self.entries.append(entry)
-
-    def add_attempts(self, attempts: list[Attempt]) -> None:
-        self.attempts += attempts
+    def add(self, records: Records, entry: PathEntry | None) -> None:
+        self.entries += [] if entry is None else [entry]
+        self.attempts += records.attempts
 
     def checkpoint(self) -> None:
         """Nothing to do."""
@@ -118,7 +117,7 @@ def test_a_fix_that_a_later_one_contradicts_is_withdrawn_and_forgotten(town: Pat
     live = drive(ROAD, np.arange(50, 75, 1.0), start_ns=3_000_000_000_000, seed=2)
     notes = Notes()
     with misled(town, live, saves=False) as (_, localiser, _):
-        memory = Memory(localiser, Saver(notes), path_id(localiser.live))
+        memory = Memory(localiser, Saver(notes, path_id(localiser.live)))
         robot = Robot(Front(Settings()), localiser, memory)
         found = [robot.step(seen.logged) for seen in live]
         memory.finish()
@@ -147,7 +146,8 @@ def test_a_mapping_robot_joins_nothing_by_a_fix_that_nothing_confirms(town: Path
     with misled(town, live, saves=True) as (opened, localiser, writer):
         assert writer is not None
         session = writer.session
-        saver = Saver(writer, NodeSaver(writer, opened.frames))
+        sink = RevisionSink(writer, opened.frames, None, Settings().placing)
+        saver = Saver(sink, path_id(session.id))
         mapper = Mapper(opened.graph, localiser, saver, session)
         robot = Robot(Front(Settings()), localiser, mapper)
         found = [robot.step(seen.logged) for seen in live]

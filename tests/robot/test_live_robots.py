@@ -19,7 +19,7 @@ from engram.maps.map import Map, open_map
 from engram.maps.map_files import check_file
 from engram.maps.sqlite import SqliteDatabase
 from engram.maps.writer import RevisionWriter
-from engram.robot.live import SavingState
+from engram.robot.drive_session import SavingState
 from engram.robot.robot import Robot
 from engram.robot.settings import Settings
 
@@ -160,9 +160,9 @@ def test_a_full_disk_ends_saving_and_not_localising(
 def killed_at_the_end(robot: Robot, frames: list[Seen]) -> Robot:
     """A robot that maps a drive, of which all was written; the process dies before it commits."""
     run(robot, frames)
-    into = robot._live._into
-    into._drive.close()
-    into._stack.close()
+    live = robot._live
+    live._session.close()
+    live._stack.close()
     robot._live = None
     robot.close()
     return robot

@@ -10,7 +10,7 @@ from tests.goldens import through
 from tests.goldens.cases import DRIVE_0001, HAMLET, KITTI_06, ROOM, DrivesMissingError, data
 
 from engram.maps.map import open_map
-from engram.robot.live import Owner
+from engram.robot.drive_session import RobotSetup
 from engram.robot.localisers import DriveSequence, session_of_drive
 from engram.robot.mapping import map_drive
 from engram.robot.settings import RobotOptions, Settings
@@ -47,8 +47,8 @@ def hamlet(_: Path) -> Iterator[DriveSequence]:
 def records_live(path: Path, drives: list[DriveSequence]) -> dict[str, str]:
     for drive in drives:
         session, settings = session_of_drive(drive), Settings()
-        owner = Owner(session.robot, drive.camera, settings, RobotOptions(), session)
-        with open_map(path, create=True) as opened, robot_in(opened, owner, maps=True) as robot:
+        setup = RobotSetup(drive.camera, settings, RobotOptions(), session.robot, session)
+        with open_map(path, create=True) as opened, robot_in(opened, setup, maps=True) as robot:
             for arrived in drive:
                 robot.step(arrived)
         assert robot.saving.revision is not None

@@ -21,8 +21,8 @@ from engram.maps.map import Map, open_map
 from engram.odometry.motion import Motion
 from engram.odometry.outside import OutsideMotion
 from engram.robot.anchors import ToldFix
+from engram.robot.drive_session import RobotSetup, Saving, SavingState
 from engram.robot.front import Arrived, Front, at_time, stamp_of
-from engram.robot.live import Owner, Saving, SavingState
 from engram.robot.robot import Robot, Whereabouts
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_in
@@ -322,9 +322,9 @@ class Driving:
         options = self.options
         try:
             self._map = self._map_of(options)
-            owner = Owner(options.name, self._camera, options.settings, options.robot)
+            setup = RobotSetup(self._camera, options.settings, options.robot, options.name)
             front = self._front_for(self._map.descriptor)
-            self._robot = robot_in(self._map, owner, maps=options.maps, front=front, fix=self._fix)
+            self._robot = robot_in(self._map, setup, maps=options.maps, front=front, fix=self._fix)
         except EngramError as error:
             if self._map is not None:
                 self._map.close()

@@ -23,7 +23,7 @@ from engram.graph.model import NodeId
 from engram.live.driving import Driving, LiveOptions, Step, Watcher
 from engram.live.served import Command, FrameEvent, Message, Transport
 from engram.localiser.localisation import Position
-from engram.robot.live import Saving
+from engram.robot.drive_session import Saving
 from engram.sequences.bags.fixes import Fix
 
 # A motion that was guessed for longer, or less surely, is no step: the robot may have stood.

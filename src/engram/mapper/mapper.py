@@ -35,7 +35,6 @@ from engram.graph.model import (
     Removal,
     Session,
     node_id,
-    path_id,
 )
 from engram.graph.proximity import ProximityConfig, lay_proximity_edges, tighten_chain
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
@@ -44,25 +43,42 @@ from engram.localiser.localisation import Hint, Keeper, Localisation, Localisati
 from engram.localiser.localiser import Localiser
 from engram.localiser.tracking import MOST_ON_TRIAL
 from engram.mapper.loops import LoopSearch
-from engram.maps.frame_reader import FrameReader
 from engram.maps.records import StoredSession
-from engram.maps.writer import RevisionWriter
 from engram.odometry.motion import Motion
-from engram.places.words import NodeWords
 
 # Most frames that wait to be written, about 40 MB; beyond it a slow disk slows the drive.
 _QUEUE_LENGTH = 1000
 
 
-class PathWriter(Protocol):
-    """Where a session's path and attempts go: a map, or a spool."""
+@dataclass(frozen=True, slots=True)
+class Records:
+    """What one live frame adds to the map.
 
-    def add_path_entry(self, entry: PathEntry) -> None:
-        """Adds a step of the session's path."""
+    Attributes:
+        stamp_ns: of the frame; None for what belongs to no single frame.
+        node, frame: the frame as a saved node; None if it was not saved.
+        edges: from or to this node, or between others.
+        attempts: of the frame.
+        visit: the node that it adds to the path, and how; None if none.
+    """
+
+    stamp_ns: int | None = None
+    node: Node | None = None
+    frame: Frame | None = None
+    edges: Sequence[Edge] = ()
+    attempts: list[Attempt] = field(default_factory=list)
+    visit: tuple[NodeId, PathEntryKind] | None = None
+
+
+class Sink(Protocol):
+    """Where the records of a drive go: a revision of a map, or a spool."""
+
+    def hold(self, node: NodeId, frame: Frame) -> None:
+        """Keeps the frame of a saved node readable until it is written."""
         ...
 
-    def add_attempts(self, made: list[Attempt]) -> None:
-        """Adds remembered attempts."""
+    def add(self, records: Records, entry: PathEntry | None) -> None:
+        """Adds what one frame adds, with its step of the path if that is a new node."""
         ...
 
     def checkpoint(self) -> None:
@@ -70,114 +86,95 @@ class PathWriter(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Records:
-    """What one live frame adds to the map."""
-
-    node: Node | None = None
-    frame: Frame | None = None
-    edges: Sequence[Edge] = ()
-    path_entries: Sequence[PathEntry] = ()
-    attempts: list[Attempt] = field(default_factory=list)
-
-    def __bool__(self) -> bool:
-        return bool(self.node or self.edges or self.path_entries or self.attempts)
-
-
-@dataclass(slots=True)
-class _Stop:
-    """The last thing in the queue."""
-
-
-@dataclass(frozen=True, slots=True)
-class NodeSaver:
-    """Saves nodes and edges.
-
-    Attributes:
-        writer: writes them.
-        frames: keeps frames readable until they are written.
-        words: finds the words stored with saved nodes; None stores none.
-    """
-
-    writer: RevisionWriter
-    frames: FrameReader
-    words: NodeWords | None = None
-
-    def hold(self, records: Records) -> None:
-        """Keeps the frame of a node readable from now on."""
-        if records.node is not None and records.frame is not None:
-            self.frames.hold(records.node.id, records.frame)
-
-    def write(self, records: Records) -> None:
-        """Writes a node with its frame and words, and edges."""
-        if records.node is not None and records.frame is not None:
-            self.writer.add_node(records.node, records.frame)
-            if self.words is not None:
-                found = self.words.of_frame(records.frame)
-                self.writer.add_words(records.node.id, self.words.hash, found)
-        for edge in records.edges:
-            self.writer.add_edge(edge)
-
-
-@dataclass(slots=True)
 class Saver:
-    """Writes records in order, and checkpoints at intervals.
+    """Writes what a drive adds, in order, on its own thread, and checkpoints at intervals.
 
-    The next call of `put` or `finish` raises an error of the writer. Later records are dropped: a
-    shorter session is better than one with holes.
+    The newest records may be held back, as long as the fixes that they rest on may be withdrawn.
+    Steps of the path are entries of it where the node changes (method §3.3).
 
-    Attributes:
-        writer: where path entries and attempts go.
-        nodes: where nodes and edges go; None for a memory, which has none.
+    The next call of `put`, `release` or `finish` raises an error of the writer. Later records are
+    dropped: a shorter session is better than one with holes.
+
+    Args:
+        sink: where the records go.
+        path: the drive's path.
         checkpoint_every: live frames between two checkpoints; a crash loses at most these.
         waits: whether a full queue blocks the caller; else it raises.
+        last: the last entry of the path that an interrupted run had stored; None for none.
     """
 
-    writer: PathWriter
-    nodes: NodeSaver | None = None
-    checkpoint_every: int = 20
-    waits: bool = True
-    _queue: Queue[Records | _Stop] = field(default_factory=lambda: Queue(_QUEUE_LENGTH))
-    _error: BaseException | None = None
-    _thread: Thread | None = None
-
-    def __post_init__(self) -> None:
-        self._thread = Thread(target=self._run, name="engram-saver", daemon=True)
+    def __init__(
+        self,
+        sink: Sink,
+        path: PathId,
+        checkpoint_every: int = 20,
+        *,
+        waits: bool = True,
+        last: PathEntry | None = None,
+    ) -> None:
+        self._sink = sink
+        self._path = path
+        self._checkpoint_every = checkpoint_every
+        self._waits = waits
+        self._node = None if last is None else last.node
+        self._sequence = 0 if last is None else last.sequence + 1
+        self._held: deque[Records] = deque()
+        # The records of each frame with its step of the path; None ends the thread.
+        self._queue: Queue[tuple[Records, PathEntry | None] | None] = Queue(_QUEUE_LENGTH)
+        self._error: BaseException | None = None
+        self._thread: Thread | None = Thread(target=self._run, name="engram-saver", daemon=True)
         self._thread.start()
 
-    def put(self, records: Records) -> None:
-        """Queues what one frame adds to the map.
+    def put(self, records: Records, held_back: int = 0) -> None:
+        """Takes what one frame adds, and queues all but so many of the newest frames.
 
         The frame of a node is readable from then on, even if it is never written.
 
         Raises:
             MapError: an earlier write failed, or too many wait to be written.
         """
-        self.hold(records)
-        self._raise_error()
-        try:
-            self._queue.put(records, block=self.waits)
-        except Full:
-            raise MapError(
-                f"{_QUEUE_LENGTH} frames wait to be saved: the disk is too slow for this drive"
-            ) from None
+        if records.node is not None and records.frame is not None:
+            self._sink.hold(records.node.id, records.frame)
+        self._held.append(records)
+        while len(self._held) > held_back:
+            records = self._held.popleft()
+            self._raise_error()
+            entry = self._entry(records)
+            if not (records.node or records.edges or records.attempts or entry):
+                continue
+            try:
+                self._queue.put((records, entry), block=self._waits)
+            except Full:
+                raise MapError(
+                    f"{_QUEUE_LENGTH} frames wait to be saved: the disk is too slow for this drive"
+                ) from None
 
-    def hold(self, records: Records) -> None:
-        """Keeps the frame of a node readable until it is put and written."""
-        if self.nodes is not None:
-            self.nodes.hold(records)
+    def withdraw(self, stamp_ns: int) -> None:
+        """A later frame disproved the match of this one: no visit, and failed attempts."""
+        for at, one in enumerate(self._held):
+            if one.stamp_ns == stamp_ns:
+                failed = [replace(attempt, accepted=False) for attempt in one.attempts]
+                self._held[at] = replace(one, attempts=failed, visit=None)
 
     def finish(self) -> None:
-        """Writes the rest, checkpoints and ends the thread.
+        """Writes what is queued, checkpoints and ends the thread; what is held back is dropped.
 
         Raises:
             MapError: a write failed.
         """
         if self._thread is not None:
-            self._queue.put(_Stop())
+            self._queue.put(None)
             self._thread.join()
             self._thread = None
         self._raise_error()
+
+    def _entry(self, records: Records) -> PathEntry | None:
+        """The step of the path that a frame makes; None while it stays at a node."""
+        if records.visit is None or records.visit[0] == self._node or records.stamp_ns is None:
+            return None
+        self._node, kind = records.visit
+        self._sequence += 1
+        return PathEntry(self._path, self._sequence - 1, self._node, kind, records.stamp_ns)
 
     def _raise_error(self) -> None:
         if self._error is not None:
@@ -186,71 +183,24 @@ class Saver:
     def _run(self) -> None:
         since_checkpoint = 0
         while True:
-            records = self._queue.get()
-            stopping = isinstance(records, _Stop)
+            queued = self._queue.get()
             if self._error is None:
                 try:
-                    if isinstance(records, Records):
-                        self._write(records)
+                    if queued is not None:
+                        self._sink.add(*queued)
                         since_checkpoint += 1
-                    if stopping or since_checkpoint >= self.checkpoint_every:
-                        self.writer.checkpoint()
+                    if queued is None or since_checkpoint >= self._checkpoint_every:
+                        self._sink.checkpoint()
                         since_checkpoint = 0
                 except BaseException as error:  # raised again in the caller's thread
                     self._error = error
-            if stopping:
+            if queued is None:
                 return
-
-    def _write(self, records: Records) -> None:
-        if self.nodes is not None:
-            self.nodes.write(records)
-        for entry in records.path_entries:
-            self.writer.add_path_entry(entry)
-        if records.attempts:
-            self.writer.add_attempts(records.attempts)
 
 
 # Uncertainty of a resumed robot's pose in the node it last matched: the match basin is wide.
 _RESUMED_SIGMA_M = 3.0
 _RESUMED_SIGMA_RAD = float(np.deg2rad(20.0))
-
-
-@dataclass(slots=True)
-class _Held:
-    """What a frame adds, while the fixes that it rests on may be withdrawn.
-
-    Attributes:
-        stamp_ns: of the frame.
-        records: without path entries.
-        visit: the node that it adds to the path, and how; None if none.
-    """
-
-    stamp_ns: int
-    records: Records
-    visit: tuple[NodeId, PathEntryKind] | None
-
-
-class Walk:
-    """Collects the entries of one session's path: one for each change of node (method §3.3)."""
-
-    def __init__(self, path: PathId, first_sequence: int = 0, node: NodeId | None = None) -> None:
-        self.path = path
-        self._sequence = first_sequence
-        self._node = node
-        self._new: list[PathEntry] = []
-
-    def visit(self, node: NodeId, kind: PathEntryKind, stamp_ns: int) -> None:
-        """Adds an entry if the node differs from the last one."""
-        if node == self._node:
-            return
-        self._new.append(PathEntry(self.path, self._sequence, node, kind, stamp_ns))
-        self._node = node
-        self._sequence += 1
-
-    def take_new(self) -> list[PathEntry]:
-        """The entries added since the last call."""
-        taken, self._new = self._new, []
-        return taken
 
 
 class Memory(Keeper):
@@ -263,20 +213,21 @@ class Memory(Keeper):
     Args:
         localiser: the drive's localiser.
         saver: writes path and attempts.
-        path: the drive's path.
         stored: what an interrupted run had stored of the drive; None for a new one.
+
+    Attributes:
+        removals: edges that the drive's fixes disproved, to be stored with it.
     """
 
+    removals: Sequence[Removal] = ()
+
     def __init__(
-        self, localiser: Localiser, saver: Saver, path: PathId, stored: StoredSession | None = None
+        self, localiser: Localiser, saver: Saver, stored: StoredSession | None = None
     ) -> None:
         self._localiser = localiser
         self._saver = saver
         self._stored = stored
-        self._held: deque[_Held] = deque()
-        self.walk = Walk(path)
         if stored is not None and stored.last_entry is not None:
-            self.walk = Walk(path, stored.next_sequence, stored.last_entry.node)
             localiser.resume(0.0, stored.next_iteration)
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
@@ -296,45 +247,29 @@ class Memory(Keeper):
     def keep(self, live: Frame, found: Localisation) -> Localisation:
         """See `Keeper`."""
         if not found.resumed:
-            self._put(live, Records(), match_of(found))
+            records = Records(
+                live.stamp_ns, attempts=self._localiser.attempts(), visit=match_of(found)
+            )
+            self._saver.put(records, self._held_back)
         return found
 
     def withdrawn(self, found: Localisation) -> None:
         """See `Keeper`: the frame was not localised, and its attempts failed."""
-        for one in self._held:
-            if one.stamp_ns == found.stamp_ns:
-                failed = [replace(attempt, accepted=False) for attempt in one.records.attempts]
-                one.records, one.visit = replace(one.records, attempts=failed), None
+        self._saver.withdraw(found.stamp_ns)
 
     def finish(self) -> None:
         """See `Keeper`: what is still held back is kept."""
-        self._release()
+        self._saver.put(Records())
+
+    @property
+    def _held_back(self) -> int:
+        """Number of the newest frames that rest on fixes on trial, at most."""
+        return MOST_ON_TRIAL if self._localiser.on_trial else 0
 
     def _is_stored(self, stamp_ns: int) -> bool:
         """Whether an interrupted run processed the frame."""
         last_ns = None if self._stored is None else self._stored.last_stamp_ns
         return last_ns is not None and stamp_ns <= last_ns
-
-    def _put(
-        self, live: Frame, records: Records, visit: tuple[NodeId, PathEntryKind] | None
-    ) -> None:
-        """Adds the frame's attempts and its visit, and hands all to the saver once it is sure."""
-        records = replace(records, attempts=self._localiser.attempts())
-        self._held.append(_Held(live.stamp_ns, records, visit))
-        waiting = MOST_ON_TRIAL if self._localiser.on_trial else 0
-        if waiting:
-            self._saver.hold(records)
-        self._release(waiting)
-
-    def _release(self, waiting: int = 0) -> None:
-        """Hands frames to the saver, but for so many of the newest."""
-        while len(self._held) > waiting:
-            one = self._held.popleft()
-            if one.visit is not None:
-                self.walk.visit(*one.visit, one.stamp_ns)
-            records = replace(one.records, path_entries=self.walk.take_new())
-            if records:
-                self._saver.put(records)
 
 
 def match_of(found: Localisation) -> tuple[NodeId, PathEntryKind] | None:
@@ -571,7 +506,7 @@ class Mapper(Memory):
         loops: LoopSearch | None = None,
         stored: StoredSession | None = None,
     ) -> None:
-        super().__init__(localiser, saver, path_id(session.id), stored)
+        super().__init__(localiser, saver, stored)
         self.config = config or MapperConfig()
         self._loops = loops
         # Whether the nodes being saved are connected to the rest of the map, and the distance
@@ -591,6 +526,7 @@ class Mapper(Memory):
         # Edges that rest on fixes on trial.
         self._waiting: dict[EdgeKey, Edge] = {}
         self.votes = EdgeVotes(graph, self.config.votes)
+        self.removals = self.votes.removals
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
         """See `Keeper`: closes the loops found so far before the frame is localised."""
@@ -635,7 +571,9 @@ class Mapper(Memory):
             saved, laid = save(live, found.measured)
             edges += laid
             visit = saved.id, PathEntryKind.SAVED
-        self._put(live, Records(node=saved, frame=live if saved else None, edges=edges), visit)
+        frame, attempts = live if saved else None, self._localiser.attempts()
+        records = Records(live.stamp_ns, saved, frame, edges, attempts, visit)
+        self._saver.put(records, self._held_back)
         if saved is None:
             return found
         if self._loops is not None:
@@ -691,8 +629,7 @@ class Mapper(Memory):
         """
         super().finish()
         edges = self._close_loops(self._loops.finish()) if self._loops else []
-        if edges:
-            self._saver.put(Records(edges=edges))
+        self._saver.put(Records(edges=edges))
 
     def _follow(self, followed: Hint, live: Frame) -> Hint:
         """Restores the mapper's state after a frame that an interrupted run had mapped."""

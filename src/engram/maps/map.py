@@ -175,14 +175,14 @@ class Map(MapWriter):
             RevisionError: it stores its drive, and the map is open at an older revision.
             MapError: the map is closed.
         """
-        from engram.robot.live import Owner
+        from engram.robot.drive_session import RobotSetup
         from engram.robot.settings import RobotOptions, Settings
         from engram.robot.starting import robot_in
 
         self._database.check_open()
         asked = RobotOptions(ranking, lanes, rounds, relocaliser=relocaliser, threads=threads)
-        owner = Owner(name, camera, settings or Settings(), asked)
-        return robot_in(self, owner, maps=maps, remembers=remembers)
+        setup = RobotSetup(camera, settings or Settings(), asked, name)
+        return robot_in(self, setup, maps=maps, remembers=remembers)
 
     @_writes
     def revert(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -19,24 +19,22 @@ from engram.errors import ConfigError, SequenceError, UnfitDriveError
 from engram.files import check_parent
 from engram.frontend.features import feature_kind
 from engram.frontend.frame import DescriptorKind, Frame, FrameStatus
-from engram.frontend.frontend import Frontend
 from engram.geometry.cameras import StereoCamera
 from engram.graph.model import Session
 from engram.keywords import keywords
 from engram.localiser.localisation import Localisation
-from engram.localiser.localiser import Localiser
 from engram.maps.map import Map, open_map
 from engram.maps.records import SessionState
-from engram.maps.writer import RevisionWriter
 from engram.monitor import QUIET, Monitor, deferred_interrupt, interruptible
 from engram.odometry.outside import MotionSource, OutsideMotion
 from engram.odometry.step import OdometryStatus
 from engram.robot.anchors import relocaliser_with_fixes
+from engram.robot.drive_session import DriveSession, RobotSetup, node_words
 from engram.robot.front import Arrived, Front, arriving, stamp_of
-from engram.robot.live import SavedDrive, commit_spools, configuration_of, node_words
-from engram.robot.localisers import DriveSequence, localiser_in, session_of_drive
+from engram.robot.localisers import DriveSequence, session_of_drive
 from engram.robot.robot import Robot
 from engram.robot.settings import RobotOptions, Settings
+from engram.robot.spool import commit_spools
 from engram.robot.starting import summarise
 from engram.sequences.framelog.file import FrameLogHeader
 from engram.sequences.framelog.log_writer import FrameLogWriter
@@ -341,7 +339,17 @@ def map_drive(
             report.resumed = opened.session_state(session.id) is SessionState.INTERRUPTED
         settings = settings.for_descriptor(None if opened is None else opened.descriptor)
         into = _written(map_path) if opened is None else nullcontext(opened)
-        _Mapping(into, sequence, settings, options, begin, report).run(monitor)
+        setup = RobotSetup(sequence.camera, settings, options, session.robot, session)
+        front = Front(settings)
+        front.examination.evidence.facts = facts_of(sequence)
+        try:
+            with closing(LookedAhead(front, sequence, monitor)) as drive:
+                report.diagnosis = front.diagnosis
+                refuse_unfit(front.diagnosis, sequence.info.name, options)
+                with into as written:
+                    _save(written, setup, drive, front, begin or (lambda _: None), report, monitor)
+        except KeyboardInterrupt:
+            report.interrupted = True
     report.skipped = sequence.skipped
     report.wrong_stamps = stamps_of(sequence).left_out
     return report
@@ -367,90 +375,39 @@ def _check_features(asked: str, found: DescriptorKind | None, what: str, mend: s
         )
 
 
-@dataclass(frozen=True)
-class _Mapping:
-    """One run of `map_drive`; `into` opens the map."""
-
-    into: AbstractContextManager[Map]
-    sequence: DriveSequence
-    settings: Settings
-    options: RobotOptions
-    begin: Callable[[Beginning], None] | None
-    report: MapReport
-
-    def run(self, monitor: Monitor) -> None:
-        """Drives through the sequence; commits at the end, or leaves it for a later run."""
-        front = Front(self.settings)
-        front.examination.evidence.facts = facts_of(self.sequence)
-        try:
-            with closing(LookedAhead(front, self.sequence, monitor)) as drive:
-                self.report.diagnosis = front.diagnosis
-                refuse_unfit(front.diagnosis, self.sequence.info.name, self.options)
-                with self.into as opened:
-                    self._save(opened, drive, front, monitor)
-        except KeyboardInterrupt:
-            self.report.interrupted = True
-
-    def _save(self, opened: Map, drive: LookedAhead, front: Front, monitor: Monitor) -> None:
-        """The same for a drive that is fit, or forced."""
-        writer = self._writer(opened)  # first: what follows reads a resumed session's nodes
-        words = node_words(opened, self.settings, self.options.relocaliser)
-        localiser = self._localiser(opened)
-        saved = SavedDrive(opened, writer, localiser, self.settings, words)
-        robot = Robot(front, localiser, saved.mapper, deadline_ms=self.options.deadline_ms)
-        if self.begin is not None:
-            self.begin(Beginning(opened, robot, self.report.resumed))
-        try:
-            with robot, closing(robot.drive(drive, monitor)) as found:
-                self.report.results.extend(one for one in found if not one.resumed)
-            self.report.diagnosis = front.diagnosis  # with what the map told of the calibration
-            saved.finish()
-        finally:
-            saved.close()
-        self.report.revision = saved.commit().number
-
-    def _writer(self, opened: Map) -> RevisionWriter:
-        """The writer of the drive's revision: a new one, or that of an interrupted run."""
-        session, name = self.report.session, self.sequence.info.name
-        if opened.session_state(session.id) is SessionState.INTERRUPTED:
-            return opened.resume_session(session.id)
-        diagnosis = self.report.diagnosis
-        assert diagnosis is not None
-        forced = ", ".join(one.code for one in diagnosis.fatal)
-        configuration = configuration_of(self.settings, self.options)
-        descriptor, frontend = _made_by(self.sequence, self.settings)
-        return opened.begin_session(
-            session,
-            self.sequence.camera,
-            descriptor=descriptor,
-            frontend=frontend,
-            author=self.options.author or session.robot,
-            message=f"map {name}" + (f" (forced: {forced})" if forced else ""),
-            configuration={**configuration, "doctor": diagnosis.to_dict()},
-        )
-
-    def _localiser(self, opened: Map) -> Localiser:
-        return localiser_in(
-            opened,
-            self.sequence.camera,
-            self.settings,
-            policy=self.options.ranking,
-            budget=self.options.budget,
-            relocaliser=relocaliser_with_fixes(
-                opened, self.sequence, self.settings, self.options.relocaliser
-            ),
-            live=self.report.session.id,
-            saves=True,
-            threads=self.options.lane_threads(maps=True),
-            clock=self.report.session,
-        )
-
-
-def _made_by(sequence: DriveSequence, settings: Settings) -> tuple[DescriptorKind, str]:
-    """Kind of descriptor and hash of the front-end; a frame log states its own."""
-    if isinstance(sequence, FrameLog):
-        return sequence.header.descriptor, sequence.header.frontend
-    return settings.frontend.descriptor, Frontend(settings.frontend).hash
+def _save(
+    opened: Map,
+    setup: RobotSetup,
+    drive: LookedAhead,
+    front: Front,
+    begin: Callable[[Beginning], None],
+    report: MapReport,
+    monitor: Monitor,
+) -> None:
+    """Drives through a drive that is fit, or forced; commits it, or leaves it for a later run."""
+    session, sequence, settings = report.session, drive.sequence, setup.settings
+    forced = ", ".join(finding.code for finding in front.diagnosis.fatal)
+    message = f"map {sequence.info.name}" + (f" (forced: {forced})" if forced else "")
+    header = setup.header(session, sequence, message, doctor=front.diagnosis.to_dict())
+    # First: what follows reads a resumed session's nodes.
+    writer = header.begin_or_resume(opened)
+    relocaliser = setup.options.relocaliser
+    words = node_words(opened, settings, relocaliser)
+    finder = relocaliser_with_fixes(opened, sequence, settings, relocaliser)
+    localiser = replace(setup, relocaliser=finder).localiser_in(opened, maps=True)
+    saved = DriveSession.mapped(opened, writer, localiser, settings, words)
+    robot = Robot(front, localiser, saved.keeper, deadline_ms=setup.options.deadline_ms)
+    begin(Beginning(opened, robot, report.resumed))
+    try:
+        with robot, closing(robot.drive(drive, monitor)) as results:
+            report.results.extend(result for result in results if not result.resumed)
+        report.diagnosis = front.diagnosis  # with what the map shows of the calibration
+        saved.finish()
+    finally:
+        saved.close()
+    revision = saved.commit()
+    assert revision is not None
+    report.revision = revision.number
 
 
 @dataclass(slots=True)

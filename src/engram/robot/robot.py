@@ -35,8 +35,8 @@ from engram.monitor import QUIET, Monitor, deferred_interrupt
 from engram.odometry.motion import Motion
 from engram.odometry.outside import OutsideMotion
 from engram.odometry.step import OdometryStatus, OdometryStep
+from engram.robot.drive_session import LiveDrive, Saving
 from engram.robot.front import Arrived, Front, arriving, at_time, check_position, paced, stamp_of
-from engram.robot.live import LiveDrive, Saving
 from engram.robot.recorder import Recorder
 from engram.sequences.clocks import Placed
 from engram.sequences.framelog.reader import compose

@@ -19,21 +19,18 @@ from engram.monitor import QUIET, Monitor
 from engram.odometry.motion import driven_steps_m
 from engram.ranking.context import RankingPolicy
 from engram.robot.anchors import ToldFix, relocaliser_with_fixes, suggesting
-from engram.robot.front import Front
-from engram.robot.live import (
-    Into,
-    IntoMap,
-    IntoMemory,
+from engram.robot.drive_session import (
     LiveDrive,
-    Owner,
+    RobotSetup,
     Saving,
     SavingState,
     commit_crashed,
-    commit_spools,
 )
-from engram.robot.localisers import DriveSequence, localiser_in, session_of_drive
+from engram.robot.front import Front
+from engram.robot.localisers import DriveSequence, session_of_drive
 from engram.robot.robot import Robot
 from engram.robot.settings import RobotOptions, Settings
+from engram.robot.spool import commit_spools
 from engram.sequences.sequence import check_name
 
 
@@ -62,29 +59,23 @@ def robot_on(
     """
     options, settings = options or RobotOptions(), settings.for_descriptor(opened.descriptor)
     session = session_of_drive(sequence)
-    finder = relocaliser_with_fixes(opened, sequence, settings, options.relocaliser)
-    if remembers:
-        _check_newest(opened)
-        owner = Owner(session.robot, sequence.camera, settings, options, session, finder)
-        return _keeping(owner, IntoMemory(owner, opened))
-    localiser = localiser_in(
-        opened,
+    setup = RobotSetup(
         sequence.camera,
         settings,
-        policy=policy or options.ranking,
-        budget=options.budget,
-        relocaliser=finder,
-        live=session.id,
-        threads=options.lane_threads(),
-        clock=sequence.info,
+        options,
+        session.robot,
+        session,
+        relocaliser_with_fixes(opened, sequence, settings, options.relocaliser),
+        policy,
     )
-    front = Front(settings, sequence.camera)
-    return Robot(front, localiser, deadline_ms=options.deadline_ms)
+    if remembers:
+        _check_newest(opened)
+    return _robot(setup, opened, LiveDrive(setup, opened, maps=False) if remembers else None)
 
 
 def robot_in(
     opened: Map,
-    owner: Owner,
+    setup: RobotSetup,
     *,
     maps: bool = False,
     remembers: bool = False,
@@ -95,37 +86,39 @@ def robot_in(
 
     A `front` continues the odometry of the robot before it; a `fix` of satellites proposes nodes.
     """
-    if not isinstance(owner.camera, StereoCamera):
-        raise InputError(f"camera is {owner.camera!r}, must be an engram.StereoCamera")
-    if owner.name is not None:
-        check_name(owner.name)
-    owner = replace(owner, settings=owner.settings.for_descriptor(opened.descriptor))
-    saving = None
-    if maps or remembers:
-        saving = _saving_in(opened, owner, maps=maps)
-        if saving.recovered:  # their drives may be played again
-            owner = replace(owner, known=frozenset(opened.sessions))
+    if not isinstance(setup.camera, StereoCamera):
+        raise InputError(f"camera is {setup.camera!r}, must be an engram.StereoCamera")
+    if setup.name is not None:
+        check_name(setup.name)
+    setup = replace(setup, settings=setup.settings.for_descriptor(opened.descriptor))
+    saving = _saving_in(opened, setup, maps=maps) if maps or remembers else None
+    if saving is not None and saving.recovered:  # their drives may be played again
+        setup = replace(setup, known=frozenset(opened.sessions))
     if fix is not None:
-        finder = suggesting(opened, fix, owner.settings, owner.options.relocaliser)
-        owner = replace(owner, finder=finder)
-    if not (maps or remembers):
-        localiser, deadline_ms = owner.localiser_in(opened), owner.options.deadline_ms
-        front = front or Front(owner.settings, owner.camera)
-        return Robot(front, localiser, deadline_ms=deadline_ms)
-    if not maps or saving is None:
-        return _keeping(owner, IntoMemory(owner, opened), front, saving)
-    try:
-        commit_spools(Path(opened.location))
-        into: Into = IntoMap(owner, open_map(opened.location))
-    except MapLockedError:
-        raise
-    except MapError as error:  # on a read-only disk it localises, as on a full one
-        saving.state, saving.reason = SavingState.FAILED, str(error)
-        into = IntoMemory(owner, opened)
-    return _keeping(owner, into, front, saving)
+        suggested = suggesting(opened, fix, setup.settings, setup.options.relocaliser)
+        setup = replace(setup, relocaliser=suggested)
+    live = None if saving is None else _live_drive(opened, setup, saving, maps=maps)
+    return _robot(setup, opened, live, front)
 
 
-def _saving_in(opened: Map, owner: Owner, *, maps: bool) -> Saving:
+def _live_drive(opened: Map, setup: RobotSetup, saving: Saving, *, maps: bool) -> LiveDrive:
+    """The drive as it is kept; where the map cannot be written, the robot localises alone.
+
+    Raises:
+        MapLockedError: another process writes to the map.
+    """
+    if maps:
+        try:
+            commit_spools(Path(opened.location))
+            return LiveDrive(setup, open_map(opened.location), maps=True, saving=saving)
+        except MapLockedError:
+            raise
+        except MapError as error:  # on a read-only disk it localises, as on a full one
+            saving.state, saving.reason = SavingState.FAILED, str(error)
+    return LiveDrive(setup, opened, maps=False, saving=saving)
+
+
+def _saving_in(opened: Map, setup: RobotSetup, *, maps: bool) -> Saving:
     """The saving of a drive that begins; first seals what a killed robot of the name had mapped.
 
     Where that cannot be written, the robot localises and saves nothing.
@@ -135,12 +128,12 @@ def _saving_in(opened: Map, owner: Owner, *, maps: bool) -> Saving:
         RevisionError: the map was opened at a named revision.
         MapLockedError: another process writes to the map.
     """
-    if owner.name is None:
+    if setup.name is None:
         raise ConfigError("a robot that keeps its drives needs a name: give name=")
     _check_newest(opened)
     saving = Saving(SavingState.ON)
     try:
-        saving.recovered = commit_crashed(opened, owner.name, owner.settings) if maps else ()
+        saving.recovered = commit_crashed(opened, setup.name, setup.settings) if maps else ()
     except MapLockedError:
         raise
     except MapError as error:
@@ -161,12 +154,12 @@ def _check_newest(opened: Map) -> None:
         )
 
 
-def _keeping(
-    owner: Owner, into: Into, front: Front | None = None, saving: Saving | None = None
+def _robot(
+    setup: RobotSetup, opened: Map, live: LiveDrive | None, front: Front | None = None
 ) -> Robot:
-    live, deadline_ms = LiveDrive(owner, into, saving), owner.options.deadline_ms
-    front = front or Front(owner.settings, owner.camera)
-    return Robot(front, into.localiser, live=live, deadline_ms=deadline_ms)
+    localiser = setup.localiser_in(opened) if live is None else live.localiser
+    front = front or Front(setup.settings, setup.camera)
+    return Robot(front, localiser, live=live, deadline_ms=setup.options.deadline_ms)
 
 
 def localise_drive(
