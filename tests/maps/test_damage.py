@@ -236,7 +236,7 @@ class TestCheckNamesTableUuidAndFact:
             change(broken, "UPDATE nodes SET stamp_ns = 0 WHERE uuid = ?", node.id.bytes)
             for read in (
                 store.load,
-                store.content_hash,
+                store.verified_hash,
                 lambda: store.frames.frame(node.id),
                 lambda: list(store.frames.stored([node])),
             ):

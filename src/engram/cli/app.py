@@ -17,7 +17,7 @@ from engram.cli.drive import drive_group, live
 from engram.cli.drives import doctor, localise, map_, record
 from engram.cli.frame import anchor, export, goal
 from engram.cli.history import diff, log, revert, show, tag
-from engram.cli.maps import amend, check, info, plot, view, vocabulary
+from engram.cli.maps import amend, check, info, plot, upgrade, view, vocabulary
 from engram.cli.options import ExitStatus, PartlyDoneError, Verb, VerbInterruptedError, spread
 from engram.cli.screen import UnwritableError, forget, screen
 from engram.cli.showing import features, settings
@@ -41,6 +41,7 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
         "view": view,
         "check": check,
         "amend": amend,
+        "upgrade": upgrade,
         "vocabulary": vocabulary,
         "anchor": anchor,
         "goal": goal,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -215,6 +216,31 @@ def _print_check(report: dict[str, Any]) -> None:
         f"{counted(report['blobs'], 'blob')}; {counted(report['abandoned_rows'], 'abandoned row')}"
         f", {report['removed_rows']} removed"
     )
+
+
+def upgrade(map_path: options.MapPath, *, as_json: options.Json = False) -> None:
+    """Convert a map of an earlier format.
+
+    Nothing is lost: the new file is compared with the old one, row by row, before it takes its
+    place. It needs as much free space as the map. Close the map everywhere else first.
+
+    \b
+    Examples:
+      engram upgrade town.engram
+      engram upgrade town.engram --json
+    """
+    from engram.maps.upgrading import upgrade_map
+
+    done = upgrade_map(map_path)
+    if as_json:
+        print(json.dumps(asdict(done)))
+    elif done.before == done.after:
+        typer.echo(f"{map_path} is of format {done.after} already")
+    else:
+        typer.echo(
+            f"{map_path}: format {done.before} → {done.after}, "
+            f"{counted(done.revisions, 'revision')}, {counted(done.rows, 'row')} compared"
+        )
 
 
 def amend(

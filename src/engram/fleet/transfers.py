@@ -305,7 +305,7 @@ def join(manifest: Manifest, source: Source, path: Path, *, thin: bool = False) 
                 put(table, _whole_rows(table, _needed(source, page), source, thin))
     try:
         with Map.open(path, at=None) as store:
-            found = store.content_hash()
+            found = store.verified_hash()
         if found != manifest.content_hash:
             raise MapCorruptError(
                 f"the parts make a map of content {found}, not {manifest.content_hash!r:.40}"

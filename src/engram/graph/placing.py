@@ -481,10 +481,29 @@ class Anchored:
     sigmas_m: Array
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Surroundings:
+    """What the layout of new nodes has to know of the map of which a graph is a part.
+
+    Attributes:
+        held: (H, 2) int64, dense indices of placed nodes that are connected elsewhere.
+        forward: the sum of the translations of each camera's odometry edges elsewhere, metres.
+        right_m: largest x of a place in the map frame; None if there is none.
+    """
+
+    held: Indices
+    forward: Mapping[str, Array]
+    right_m: float | None
+
+
+_NOTHING_ELSE = Surroundings(np.zeros((0, 2), np.int64), {}, None)
+
+
 def place(
     graph: ExperienceGraph,
     placed: Mapping[NodeId, SE3],
     config: PlacingConfig = DEFAULT_CONFIG,
+    rest: Surroundings | None = None,
 ) -> Poses:
     """Lays out the nodes that have no place around those that have one.
 
@@ -492,6 +511,8 @@ def place(
         graph: the experience graph.
         placed: ``map_from_node`` of nodes that have a place.
         config: settings.
+        rest: of a graph that is new nodes and the other ends of their edges; those then keep
+            their places. None for the graph of a whole map.
 
     Returns:
         The pose of every node, by dense index. Placed nodes keep theirs, except where two placed
@@ -502,7 +523,7 @@ def place(
         if node in graph:
             poses.set(graph.index(node), pose)
             fixed[graph.index(node)] = True
-    return _Placing.of(graph, config).around(poses, fixed)
+    return _Placing.of(graph, config, rest).around(poses, fixed)
 
 
 def replace_after_removal(
@@ -564,6 +585,7 @@ class _Placing:
         ups: (N, 3) float64, the direction in each node's camera that is up.
         labels: (N,) int64, the component of each node.
         config: settings.
+        rest: of a part of a map; None for a whole one.
     """
 
     edges: list[Edge]
@@ -572,15 +594,20 @@ class _Placing:
     ups: Array
     labels: Indices
     config: PlacingConfig
+    rest: Surroundings | None = None
 
     @staticmethod
-    def of(graph: ExperienceGraph, config: PlacingConfig) -> _Placing:
-        """That of a whole graph."""
+    def of(
+        graph: ExperienceGraph, config: PlacingConfig, rest: Surroundings | None = None
+    ) -> _Placing:
+        """That of a whole graph, or of a part of a map."""
         both = graph.edge_ends.astype(np.int64)[:, ::-1]  # of a and b
-        edges, ends = _used(graph.edges, both, len(graph))
+        held, forward = (rest or _NOTHING_ELSE).held, (rest or _NOTHING_ELSE).forward
+        edges, ends = _used(graph.edges, both, held, len(graph))
         measured = Measured.of(edges, ends, config.adjust)
-        ups = _ups([node.camera for node in graph.nodes], edges, ends)
-        return _Placing(edges, ends, measured, ups, labels_of(ends, len(graph)), config)
+        ups = _ups([node.camera for node in graph.nodes], edges, ends, forward)
+        labels = labels_of(np.concatenate([ends, held]), len(graph))
+        return _Placing(edges, ends, measured, ups, labels, config, rest)
 
     def components(self) -> list[Indices]:
         """Dense indices of each component, the largest first; of equal ones the earlier."""
@@ -599,8 +626,15 @@ class _Placing:
             rows = edges_of.get(int(self.labels[members[0]]), nothing)
             ends = np.searchsorted(members, self.ends[rows])
             measured = replace(self.measured.rows(rows), a=ends[:, 0], b=ends[:, 1])
-            edges, labels = [self.edges[row] for row in rows.tolist()], np.zeros_like(members)
-            yield members, _Placing(edges, ends, measured, self.ups[members], labels, self.config)
+            part = replace(
+                self,
+                edges=[self.edges[row] for row in rows.tolist()],
+                ends=ends,
+                measured=measured,
+                ups=self.ups[members],
+                labels=np.zeros_like(members),
+            )
+            yield members, part
 
     def around(self, poses: Poses, fixed: NDArray[np.bool_]) -> Poses:
         """Lays out the nodes that are not fixed."""
@@ -612,7 +646,8 @@ class _Placing:
                 fresh.append((members, part))
                 continue
             inside, placed = poses.some(members), fixed[members]
-            part._keep_largest_part(inside, placed)
+            if self.rest is None:
+                part._keep_largest_part(inside, placed)
             poses.put(members, part._solved(inside, placed))
             taken[members] = True
         right_m = self._right_m(poses, taken)
@@ -640,9 +675,10 @@ class _Placing:
 
     def _right_m(self, poses: Poses, taken: NDArray[np.bool_]) -> float | None:
         """Where the next component begins; None for the first."""
-        if not taken.any():
-            return None
-        return float(poses.translations[taken, 0].max()) + self.config.apart_m
+        placed_m = [] if self.rest is None or self.rest.right_m is None else [self.rest.right_m]
+        if taken.any():
+            placed_m.append(float(poses.translations[taken, 0].max()))
+        return max(placed_m) + self.config.apart_m if placed_m else None
 
     def adjusted_whole(self, poses: Poses) -> Poses:
         """All components adjusted from where they are, each with its first node fixed."""
@@ -840,12 +876,14 @@ def fit_level(old: Array, new: Array) -> SE3:
     return SE3(turn, shift)
 
 
-def _used(edges: Sequence[Edge], ends: Indices, count: int) -> tuple[list[Edge], Indices]:
+def _used(
+    edges: Sequence[Edge], ends: Indices, held: Indices, count: int
+) -> tuple[list[Edge], Indices]:
     """The measured edges, and those predicted ones without which parts would be apart."""
     from scipy.cluster.hierarchy import DisjointSet
 
     derived = np.array([edge.kind is EdgeKind.PROXIMITY for edge in edges], np.bool_)
-    measured = labels_of(ends[~derived], count)
+    measured = labels_of(np.concatenate([ends[~derived], held]), count)
     parts = DisjointSet(range(int(measured.max(initial=-1)) + 1))
     kept = ~derived
     spread = [
@@ -858,9 +896,11 @@ def _used(edges: Sequence[Edge], ends: Indices, count: int) -> tuple[list[Edge],
     return [edges[row] for row in rows.tolist()], ends[rows].reshape(-1, 2)
 
 
-def _ups(cameras: Sequence[str], edges: Sequence[Edge], ends: Indices) -> Array:
+def _ups(
+    cameras: Sequence[str], edges: Sequence[Edge], ends: Indices, moved: Mapping[str, Array]
+) -> Array:
     """(N, 3): the direction in each node's camera that is up, as the camera's motion shows."""
-    forward: dict[str, Array] = {}
+    forward = {camera: shift.copy() for camera, shift in moved.items()}
     for edge, (_, b) in zip(edges, ends.tolist(), strict=True):
         if edge.kind is EdgeKind.ODOMETRY:
             known = forward.setdefault(cameras[b], np.zeros(3))

@@ -24,6 +24,7 @@ from engram.frontend.frame import DescriptorKind, FrameStatus
 from engram.geometry.cameras import StereoCamera
 from engram.graph.model import NodeId, PathEntryKind, SessionId
 from engram.maps.attempts import decode_words, unpack
+from engram.maps.content import verified_hash
 from engram.maps.marks import goal_from_row, removal_from_row
 from engram.maps.records import CheckReport, Problem
 from engram.maps.rows import (
@@ -39,6 +40,7 @@ from engram.maps.rows import (
     uuid_from_bytes,
     verified,
 )
+from engram.maps.runs import load_runs
 from engram.maps.schema import (
     FORMAT_VERSION,
     VERSIONED,
@@ -60,6 +62,7 @@ from engram.maps.schema import (
     placements,
     removals,
     revisions,
+    runs,
     sessions,
     statistics,
     tag_tally,
@@ -68,7 +71,8 @@ from engram.maps.schema import (
     words,
 )
 from engram.maps.sqlite import SqliteDatabase
-from engram.maps.view import LARGEST_KEY
+from engram.maps.totals import count_all, own_rows, totals_at
+from engram.maps.view import LARGEST_KEY, View, head
 
 # The table that a column refers to.
 _REFERENCES = {
@@ -80,7 +84,7 @@ _REFERENCES = {
     "b": nodes,
     "path": paths,
 }
-_ORDER = (map_format, revisions, cameras, frontends, *VERSIONED, tags, tag_tally, words)
+_ORDER = (map_format, revisions, cameras, frontends, *VERSIONED, tags, tag_tally, words, runs)
 assert set(_ORDER) == set(metadata.sorted_tables)
 
 # Rounding of rotations that come from chains of products.
@@ -123,6 +127,8 @@ class _Checking:
     landmark_hashes: dict[int, tuple[bytes, int, int]] = field(default_factory=dict)
     uuids: dict[tuple[Table, int], str] = field(default_factory=dict)
     brought: Counter[tuple[int, str]] = field(default_factory=Counter)
+    # First and last key of the rows of each revision, by table.
+    ranges: dict[tuple[int, str], tuple[int, int]] = field(default_factory=dict)
     session_ids: dict[int, SessionId] = field(default_factory=dict)
     # Sessions that an open revision shows again, with that revision.
     shown_again: dict[int, int] = field(default_factory=dict)
@@ -182,7 +188,10 @@ class _Checking:
 
     def _count(self, table: Table, row: Row) -> None:
         amount = row["count"] if table is attempts else 1
-        self.brought[row["revision"], table.name] += amount
+        named = row["revision"], table.name
+        self.brought[named] += amount
+        key = next(iter(row.values()))  # they come in this order
+        self.ranges[named] = self.ranges.get(named, (key, key))[0], key
 
     def _check_references(self, table: Table, row: Row, name: str) -> None:
         revision = self.revision_rows.get(row["revision"])
@@ -221,6 +230,22 @@ class _Checking:
         if len(self.revision_of[map_format]) != 1:
             self.report(map_format, "", "must have one row")
         self._check_tally()
+        if not self.problems:
+            self._check_sums()
+
+    def _check_sums(self) -> None:
+        """Works out again what a map stores of all its rows."""
+        try:
+            with self.database.reading() as connection:
+                newest = head(connection)
+                verified_hash(connection, newest)
+                totals, known = count_all(connection, View(newest))
+                if not totals.agrees(totals_at(connection, newest)):
+                    self.report(revisions, str(newest), "its totals are not those of the rows")
+                if not known.agrees(load_runs(connection)):
+                    self.report(runs, "", "are not those of the nodes and edges")
+        except EngramError as error:
+            self.report(revisions, "", str(error))
 
     def _check_tally(self) -> None:
         try:
@@ -242,6 +267,7 @@ class _Checking:
                 )
             try:
                 contents = from_json(row["contents"], f"revision {name}")
+                ranges = own_rows(row).ranges
             except MapCorruptError as error:
                 self.report(revisions, name, str(error))
                 continue
@@ -251,6 +277,10 @@ class _Checking:
                 if brought != found:
                     self.report(
                         table, "", f"revision {name} added {brought} rows, but {found} are stored"
+                    )
+                elif ranges.get(table.name) != self.ranges.get((row["key"], table.name)):
+                    self.report(
+                        table, "", f"revision {name} has other rows than its ranges of keys say"
                     )
 
     def _brought_by(self, session_key: int) -> Row | None:

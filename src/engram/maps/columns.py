@@ -51,7 +51,12 @@ class Columns:
 
 
 def read_columns(
-    connection: Connection, view: View, table: Table, sizes: Mapping[str, int] | None = None
+    connection: Connection,
+    view: View,
+    table: Table,
+    sizes: Mapping[str, int] | None = None,
+    *,
+    within: tuple[int, int] | None = None,
 ) -> Columns:
     """The visible rows of a table.
 
@@ -60,18 +65,30 @@ def read_columns(
         view: which rows are visible.
         table: has neither columns that may be empty nor bytes of varying number.
         sizes: number of bytes in each column of bytes.
+        within: only rows with primary keys from the first up to the second.
 
     Raises:
         MapCorruptError: a row does not match its checksum, or holds another number of bytes.
     """
-    found = connection.execute(view.by_key(table)).cursor
+    query = view.by_key(table)
+    if within is not None:
+        query = query.where(table.primary_key.columns[0].between(*within))
+    found = connection.execute(query).cursor
     assert found is not None
-    rows = list(found.fetchall())
+    named = verified_arrays(table, list(found.fetchall()), sizes or {})
+    whole = Columns(
+        {name: array for name, array in named.items() if not isinstance(array, tuple)},
+        {name: array for name, array in named.items() if isinstance(array, tuple)},
+    )
+    return _in_history(connection, view, whole)
+
+
+def verified_arrays(
+    table: Table, rows: list[tuple[Any, ...]], sizes: Mapping[str, int]
+) -> dict[str, Any]:
+    """The columns of rows, each checked against its checksum; see `_core.verified_columns`."""
     columns = list(table.columns)[:-1]
-    kinds = [
-        _KINDS.get(column.type.python_type) or f"b{(sizes or {})[column.name]}"
-        for column in columns
-    ]
+    kinds = [_KINDS.get(column.type.python_type) or f"b{sizes[column.name]}" for column in columns]
     arrays, bad, at = _core.verified_columns(rows, kinds)
     if arrays is None:
         if at < 0:
@@ -80,12 +97,7 @@ def read_columns(
             f"table {table.name}: {describe(table, rows[bad])}: column {columns[at].name} takes "
             f"{kinds[at][1:]} bytes, not {rows[bad][at]!r:.40}"
         )
-    named = {column.name: array for column, array in zip(columns, arrays, strict=True)}
-    whole = Columns(
-        {name: array for name, array in named.items() if not isinstance(array, tuple)},
-        {name: array for name, array in named.items() if isinstance(array, tuple)},
-    )
-    return _in_history(connection, view, whole)
+    return {column.name: array for column, array in zip(columns, arrays, strict=True)}
 
 
 def _in_history(connection: Connection, view: View, columns: Columns) -> Columns:

@@ -1,15 +1,21 @@
-"""The content hash: equal for equal maps, independent of place and time (method §7.5)."""
+"""The content hash: equal for equal maps, independent of place and time (method §7.5).
+
+That of a revision is made of the one before and of what the revision adds, so that a commit hashes
+its own rows alone.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+import re
+from collections import defaultdict
+from collections.abc import Collection, Iterator
 from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Table, select
+from sqlalchemy import ColumnElement, Connection, Table, select
 
 from engram.errors import MapCorruptError
 from engram.graph.paths import Attempts
@@ -21,12 +27,14 @@ from engram.maps.schema import (
     attempts,
     frames,
     hidden,
+    metadata,
     nodes,
     paths,
     placements,
     revisions,
     sessions,
 )
+from engram.maps.totals import Own, own_rows
 from engram.maps.view import View
 
 _encode = msgspec.msgpack.Encoder().encode
@@ -46,29 +54,76 @@ _REFERENCES = {
 # since they follow from the rest to the rounding of a linear solver.
 _HASHED = tuple(table for table in VERSIONED if table not in {frames, placements})
 _LEFT_OUT = {"key", "checksum"}
-# Tables that count only if they hold rows.
-_IF_ANY = {"amendments", "anchors", "goals", "omitted_landmarks", "removals"}
-
-Identities = dict[str, dict[int, Any]]
+_HISTORY = ("number", "parent", "author", "message", "tool_version", "configuration")
+# Keys in one statement.
+_FEW = 500
 
 
 def content_hash(connection: Connection, at: int) -> str:
-    """Hash of all rows of the committed revisions up to `at`, 32 hexadecimal digits.
+    """Hash of all committed revisions up to `at`, 32 hexadecimal digits, as stored.
 
     Rows are hashed in canonical order, with UUIDs and revision numbers in place of keys, without
     the time and host of writing.
 
     Raises:
+        MapCorruptError: the row of the revision is damaged.
+    """
+    if at == 0:
+        return EMPTY_HASH
+    query = select(revisions).where(revisions.c.number == at)
+    found = str(next(verified(revisions, connection.execute(query)))["chain"])
+    if not re.fullmatch("[0-9a-f]{32}", found):
+        raise MapCorruptError(f"revision {at}: {found!r:.40} is not a content hash")
+    return found
+
+
+def verified_hash(connection: Connection, at: int) -> str:
+    """`content_hash`, worked out again from all rows.
+
+    Raises:
+        MapCorruptError: a row is damaged or points at nothing, or a stored hash is another.
+    """
+    known, found = Identities(connection), EMPTY_HASH
+    query = select(revisions).where(revisions.c.number <= at).order_by(revisions.c.number)
+    for row in list(verified(revisions, connection.execute(query))):
+        found = chained(connection, found, row, own_rows(row), known)
+        if found != row["chain"]:
+            raise MapCorruptError(
+                f"revision {row['number']}: its rows have the content hash {found}, not "
+                f"{row['chain']!r:.40}"
+            )
+    return found
+
+
+def chained(
+    connection: Connection, before: str, row: Row, own: Own, known: Identities | None = None
+) -> str:
+    """The content hash as of a revision.
+
+    Args:
+        connection: of the map.
+        before: the content hash as of the one before.
+        row: of the revision, with its number.
+        own: its rows.
+        known: what is known of other rows; None for nothing yet.
+
+    Raises:
         MapCorruptError: a row is damaged or points at nothing.
     """
-    view = View(at)
-    digest = hashlib.sha256(_history(connection, view))
-    for name, rows in _canonical(connection, view).items():
-        if not rows and name in _IF_ANY:
-            continue
-        for part in _parts(name, rows):
-            digest.update(part)
+    known = known or Identities(connection)
+    known.add_revision(row["key"], row["number"])
+    digest = hashlib.sha256(bytes.fromhex(before))
+    digest.update(_encode([row[name] for name in _HISTORY]))
+    for table in _HASHED:
+        if table.name in own.ranges:
+            rows = _canonical_rows(connection, table, own.rows(table), known)
+            for part in _parts(table.name, sorted(set(rows.values()))):
+                digest.update(part)
     return digest.hexdigest()[:32]
+
+
+# Of a map before its first revision.
+EMPTY_HASH = hashlib.sha256(b"").hexdigest()[:32]
 
 
 def record_hashes(connection: Connection, at: int) -> dict[str, str]:
@@ -81,93 +136,90 @@ def record_hashes(connection: Connection, at: int) -> dict[str, str]:
         MapCorruptError: a row is damaged or points at nothing.
     """
     found = {}
-    for name, rows in _canonical(connection, View(at)).items():
+    known, seen = Identities(connection), View(at).revision_keys()
+    for table in _HASHED:
+        rows = _canonical_rows(connection, table, table.c.revision.in_(seen), known)
         if rows:
             digest = hashlib.sha256()
-            for part in _parts(name, rows):
+            for part in _parts(table.name, sorted(set(rows.values()))):
                 digest.update(part)
-            found[name] = digest.hexdigest()[:16]
+            found[str(table.name)] = digest.hexdigest()[:16]
     return found
-
-
-def _canonical(connection: Connection, view: View) -> dict[str, list[bytes]]:
-    """The rows of each table in canonical order; one for all attempts of a session."""
-    identities = _identities(connection, view)
-    by_key = {
-        str(table.name): _canonical_rows(connection, view, table, identities)
-        for table in _HASHED
-        if table is not hidden
-    }
-    by_key[str(hidden.name)] = _hidden_rows(connection, view, identities, by_key)
-    return {name: sorted(set(rows.values())) for name, rows in by_key.items()}
 
 
 def _parts(name: str, rows: list[bytes]) -> Iterator[bytes]:
-    yield _encode([name, len(rows)])
+    yield _encode([str(name), len(rows)])
     yield from rows
 
 
-def _history(connection: Connection, view: View) -> bytes:
-    query = (
-        select(revisions)
-        .where(revisions.c.key.in_(view.revision_keys()))
-        .order_by(revisions.c.number)
-    )
-    told = ("number", "parent", "author", "message", "tool_version", "configuration")
-    rows = verified(revisions, connection.execute(query))
-    return _encode([[row[name] for name in told] for row in rows])
+class Identities:
+    """What names a row in all equal maps, by table and key; read when first needed."""
 
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        numbers = select(revisions.c.key, revisions.c.number).where(revisions.c.number.is_not(None))
+        self._known: dict[str, dict[int, Any]] = {
+            "revisions": {row[0]: row[1] for row in connection.execute(numbers)},
+            "cameras": {key: camera.id for key, camera in load_cameras(connection).items()},
+            "frontends": {
+                key: [str(descriptor), digest]
+                for key, (descriptor, digest) in load_frontends(connection).items()
+            },
+            **{str(table.name): {} for table in (sessions, nodes, paths)},
+        }
 
-def _identities(connection: Connection, view: View) -> Identities:
-    """Identity of each row, equal in equal maps, by table and key."""
-    numbers = select(revisions.c.key, revisions.c.number).where(
-        revisions.c.key.in_(view.revision_keys())
-    )
-    found: Identities = {
-        "revisions": {row[0]: row[1] for row in connection.execute(numbers)},
-        "cameras": {key: camera.id for key, camera in load_cameras(connection).items()},
-        "frontends": {
-            key: [str(descriptor), digest]
-            for key, (descriptor, digest) in load_frontends(connection).items()
-        },
-    }
-    for table in (sessions, nodes, paths):
-        uuids = select(table.c.key, table.c.uuid).order_by(table.c.key)
-        found[str(table.name)] = {row[0]: row[1] for row in connection.execute(uuids)}
-    return found
+    def add_revision(self, key: int, number: int) -> None:
+        """Adds the revision that is being committed."""
+        self._known["revisions"][key] = number
+
+    def of(self, table: str, keys: Collection[int]) -> dict[int, Any]:
+        """Those of at least these keys of a table.
+
+        Raises:
+            MapCorruptError: there is no such row.
+        """
+        known = self._known[table]
+        wanted = sorted(set(keys) - known.keys())
+        uuids = metadata.tables[table]
+        for at in range(0, len(wanted), _FEW) if "uuid" in uuids.c else ():
+            query = select(uuids.c.key, uuids.c.uuid).where(uuids.c.key.in_(wanted[at : at + _FEW]))
+            known.update(map(tuple, self._connection.execute(query)))
+        missing = [key for key in wanted if key not in known]
+        if missing:
+            raise MapCorruptError(f"table {table}: row {missing[0]}, which others use, is missing")
+        return known
 
 
 def _canonical_rows(
-    connection: Connection, view: View, table: Table, identities: Identities
+    connection: Connection, table: Table, which: ColumnElement[bool], known: Identities
 ) -> dict[int, bytes]:
     """One byte string per row, by key; the same for all attempts of a revision and session."""
-    query = (
-        select(table)
-        .where(table.c.revision.in_(view.revision_keys()))
-        .order_by(*table.primary_key.columns)
-    )
+    query = select(table).where(which).order_by(*table.primary_key.columns)
     found = connection.execute(query)
     if table is attempts:
-        return _canonical_attempts(list(verified(table, found)), identities)
+        return _canonical_attempts(list(verified(table, found)), known)
+    if table is hidden:
+        return _canonical_hidden(connection, list(verified(table, found)), known)
+    rows = list(verified_values(table, found))
+    names = [column.name for column in table.columns]
     # Tens of thousands of rows: what is the same for all of them is looked up once.
     columns = [
-        (at, _REFERENCES.get(column.name))
-        for at, column in enumerate(table.columns)
-        if column.name not in _LEFT_OUT
+        (at, None if (other := _REFERENCES.get(name)) is None else known.of(other, _at(rows, at)))
+        for at, name in enumerate(names)
+        if name not in _LEFT_OUT
     ]
-    key = [column.name for column in table.columns].index("key")
+    key = names.index("key")
     return {
-        row[key]: _encode(
-            [
-                row[at] if other is None else _identity(identities, other, row[at])
-                for at, other in columns
-            ]
-        )
-        for row in verified_values(table, found)
+        row[key]: _encode([row[at] if named is None else named[row[at]] for at, named in columns])
+        for row in rows
     }
 
 
-def _canonical_attempts(rows: list[Row], identities: Identities) -> dict[int, bytes]:
+def _at(rows: list[Any], at: int) -> set[int]:
+    return {row[at] for row in rows}
+
+
+def _canonical_attempts(rows: list[Row], known: Identities) -> dict[int, bytes]:
     """Attempts, independent of their packing."""
     packed: dict[tuple[int, int], list[Row]] = {}
     for row in rows:
@@ -177,47 +229,64 @@ def _canonical_attempts(rows: list[Row], identities: Identities) -> dict[int, by
         table = Attempts.joined([unpack(row["body"], row["count"]) for row in bodies])
         content = _encode(
             [
-                _identity(identities, "revisions", revision),
-                _identity(identities, "sessions", session),
+                known.of("revisions", [revision])[revision],
+                known.of("sessions", [session])[session],
                 list(table.policies),
                 table.policy.astype("<i4").tobytes(),
-                *(_column_bytes(table, name, identities) for name in COLUMNS),
+                *(_column_bytes(table, name, known) for name in COLUMNS),
             ]
         )
         found.update((row["key"], content) for row in bodies)
     return found
 
 
-def _column_bytes(table: Attempts, name: str, identities: Identities) -> bytes:
+def _column_bytes(table: Attempts, name: str, known: Identities) -> bytes:
     values: NDArray[np.generic] = getattr(table, name)
     if name in {"reference", "node"}:
         keys, index = np.unique(values, return_inverse=True)
-        uuids = [_identity(identities, "nodes", int(key)) for key in keys]
+        named = known.of("nodes", keys.tolist())
+        uuids = [named[int(key)] for key in keys]
         return b"".join(uuids[at] for at in index)
     return values.astype(values.dtype.newbyteorder("<")).tobytes()
 
 
-def _hidden_rows(
-    connection: Connection,
-    view: View,
-    identities: Identities,
-    canonical: dict[str, dict[int, bytes]],
+def _canonical_hidden(
+    connection: Connection, rows: list[Row], known: Identities
 ) -> dict[int, bytes]:
-    query = select(hidden).where(hidden.c.revision.in_(view.revision_keys())).order_by(hidden.c.key)
+    """Rows that hide others, each with the row that it hides."""
+    targets: dict[str, set[int]] = defaultdict(set)
+    for row in rows:
+        if row["record"] != placements.name:
+            targets[row["record"]].add(row["target"])
+    canonical = {
+        name: _canonical_targets(connection, metadata.tables[name], sorted(keys), known)
+        for name, keys in targets.items()
+        if metadata.tables.get(name) in _HASHED and name != hidden.name
+    }
     found = {}
-    for row in verified(hidden, connection.execute(query)):
+    for row in rows:
         if row["record"] == placements.name:
             continue
         target = canonical.get(row["record"], {}).get(row["target"])
         if target is None:
             raise MapCorruptError(f"table hidden: row {row['key']} hides a row that is missing")
-        revision = _identity(identities, "revisions", row["revision"])
-        found[row["key"]] = _encode([revision, row["record"], target, row["hidden"]])
+        number = known.of("revisions", [row["revision"]])[row["revision"]]
+        found[row["key"]] = _encode([number, row["record"], target, row["hidden"]])
     return found
 
 
-def _identity(identities: Identities, table: str, key: int) -> Any:
-    try:
-        return identities[table][key]
-    except KeyError:
-        raise MapCorruptError(f"table {table}: row {key}, which others use, is missing") from None
+def _canonical_targets(
+    connection: Connection, table: Table, keys: list[int], known: Identities
+) -> dict[int, bytes]:
+    """The rows of these keys; of attempts, with all others of their revision and session."""
+    found: dict[int, bytes] = {}
+    for at in range(0, len(keys), _FEW):
+        which = table.c.key.in_(keys[at : at + _FEW])
+        if table is attempts:
+            pairs = select(attempts.c.session, attempts.c.revision).where(which).distinct()
+            for session, revision in connection.execute(pairs).fetchall():
+                both = (attempts.c.session == session) & (attempts.c.revision == revision)
+                found |= _canonical_rows(connection, table, both, known)
+        else:
+            found |= _canonical_rows(connection, table, which, known)
+    return found

@@ -14,13 +14,25 @@ from sqlalchemy import Select, Table, insert, select
 
 from engram.files import new_file
 from engram.maps.rows import count_tags, verified
-from engram.maps.schema import KEYED, VERSIONED, cameras, frontends, nodes, revisions, tags, words
+from engram.maps.runs import save_runs
+from engram.maps.schema import (
+    VERSIONED,
+    cameras,
+    frontends,
+    metadata,
+    nodes,
+    revisions,
+    tags,
+    words,
+)
 from engram.maps.sqlite import SqliteDatabase
+from engram.maps.totals import count_all
 from engram.maps.view import View, head
 
 # In the order in which rows refer to each other.
 EXCHANGED: tuple[Table, ...] = (revisions, cameras, frontends, *VERSIONED, tags, words)
-assert len(EXCHANGED) == len(KEYED)  # all tables but those of the format and of the tally
+# All tables but those of the format, of the tally and of the runs.
+assert len(EXCHANGED) == len(metadata.tables) - 3
 
 _ROWS_AT_ONCE = 200
 
@@ -83,7 +95,7 @@ def map_of_rows(path: Path) -> Iterator[PutRows]:
 
     Raises:
         InputError: the file exists already, or its folder does not.
-        MapCorruptError: a row does not match its checksum.
+        MapCorruptError: a row does not match its checksum, or refers to none.
         MapError: a row contradicts another one, or the file cannot be written.
     """
     with new_file(path) as draft:
@@ -97,3 +109,4 @@ def map_of_rows(path: Path) -> Iterator[PutRows]:
 
             yield put
             count_tags(connection)
+            save_runs(connection, None, count_all(connection, View(head(connection)))[1])

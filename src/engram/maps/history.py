@@ -184,12 +184,9 @@ def blame_node(path: Path, prefix: str) -> dict[str, Any]:
     """
     with open_map(path) as store:
         origin = store.origin(prefix)
-        log = {one.number: one for one in store.log()}
-        contents = store.load()
-    session = next((one for one in contents.sessions if one.id == origin.session), None)
-    brought = log[origin.brought]
-    place = {node.id: at for at, node in enumerate(contents.nodes)}.get(origin.node, -1)
-    tried = contents.attempts.node == place
+        brought = store.newest_revision(origin.brought)
+        session = store.sessions.get(origin.session)
+    assert brought is not None
     return {
         "node": str(origin.node),
         "robot": origin.robot,
@@ -205,12 +202,10 @@ def blame_node(path: Path, prefix: str) -> dict[str, Any]:
         "message": brought.message,
         "visible": origin.visible,
         "told": [{"revision": by, "hidden": hidden} for by, hidden in origin.told],
-        "edges": dict(
-            Counter(str(edge.kind) for edge in contents.edges if origin.node in {edge.a, edge.b})
-        ),
-        "paths": len({e.path for e in contents.path_entries if e.node == origin.node}),
-        "attempts": int(tried.sum()),
-        "matches": int(contents.attempts.accepted[tried].sum()),
+        "edges": dict(origin.edges),
+        "paths": origin.paths,
+        "attempts": origin.attempts,
+        "matches": origin.matches,
     }
 
 

@@ -317,10 +317,10 @@ def frame_of(store: MapReader, revision: int, nodes: int) -> MapFrame:
     return MapFrame(graph, place(graph, store.placements), known)
 
 
-def new_places(
+def all_places(
     store: MapReader, contents: Mapping[str, float], config: PlacingConfig
 ) -> list[Placement]:
-    """The places that an open revision has to write, around those that nodes have.
+    """The places that an open revision has to write, by a layout of the whole map.
 
     Args:
         store: the map, which sees the rows of the revision.

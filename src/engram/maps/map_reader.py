@@ -36,10 +36,11 @@ from engram.graph.paths import Attempts, PathMemory
 from engram.maps import marks, reading
 from engram.maps.attempts import load_words
 from engram.maps.checking import check
-from engram.maps.content import content_hash, record_hashes
+from engram.maps.content import content_hash, record_hashes, verified_hash
 from engram.maps.difference import STRETCH_M, MapDifference, difference
 from engram.maps.frame_reader import FrameReader
 from engram.maps.map_frame import MapFrame, frame_of, graph_of
+from engram.maps.origins import Origin, origin_of
 from engram.maps.records import (
     CheckReport,
     InterruptedSession,
@@ -52,7 +53,8 @@ from engram.maps.revisions import interrupted_sessions, session_and_revision
 from engram.maps.rows import Row, verified
 from engram.maps.schema import revisions
 from engram.maps.sqlite import SqliteDatabase, reading_rows
-from engram.maps.tags import Origin, Tag, load_tags, origin_of, resolve
+from engram.maps.tags import Tag, load_tags, resolve
+from engram.maps.totals import Totals, info, totals_of
 from engram.maps.view import View
 
 
@@ -356,7 +358,7 @@ class MapReader:
     def info(self) -> MapInfo:
         """Counts and sizes of the map."""
         with self._database.reading() as connection:
-            return reading.info(
+            return info(
                 connection,
                 self._view,
                 size_bytes=self._database.size_bytes(),
@@ -424,6 +426,19 @@ class MapReader:
         """32 hexadecimal digits, equal for maps of equal content (method §7.5)."""
         with self._database.reading() as connection:
             return content_hash(connection, self._view.at)
+
+    def verified_hash(self) -> str:
+        """`content_hash`, worked out again from all rows.
+
+        Raises:
+            MapCorruptError: a stored one is another, or a row is damaged.
+        """
+        with self._database.reading() as connection:
+            return verified_hash(connection, self._view.at)
+
+    def totals(self) -> Totals:
+        """What the map holds, in numbers."""
+        return self._read(totals_of)
 
     def record_hashes(self) -> dict[str, str]:
         """Hash of each table's rows without revision metadata, 16 hexadecimal digits."""

@@ -17,7 +17,8 @@ from engram.graph.model import NodeId, Placement, Session, SessionId
 from engram.graph.placing import PlacingConfig
 from engram.maps import reading
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES
-from engram.maps.map_frame import new_places
+from engram.maps.laying_out import new_places
+from engram.maps.map_frame import all_places
 from engram.maps.map_reader import MapReader
 from engram.maps.records import Revision, SessionState
 from engram.maps.revisions import (
@@ -30,6 +31,7 @@ from engram.maps.revisions import (
 from engram.maps.rows import Row, sealed, session_from_row
 from engram.maps.schema import revisions
 from engram.maps.sqlite import SqliteDatabase
+from engram.maps.totals import Own
 from engram.maps.view import KeyBook, View, head
 from engram.maps.writer import Resumable, RevisionWriter
 
@@ -244,13 +246,19 @@ class MapWriter(MapReader):
         )
         return self._writing
 
-    def _new_places(self, contents: Mapping[str, float], config: PlacingConfig) -> list[Placement]:
+    def _new_places(
+        self, contents: Mapping[str, float], own: Own, config: PlacingConfig
+    ) -> list[Placement]:
         """The part of the layout that the open revision has to write; completes the layout."""
-        found = new_places(self, contents, config)
-        if contents["placements"] or contents["hidden"]:
+        with self._database.reading() as connection:
+            found = new_places(connection, self._view, contents, own, config)
+        if found is None:
+            found = all_places(self, contents, config)
+        known = self.__dict__.get("placements")
+        if known is None or contents["placements"] or contents["hidden"]:
             self._laid_out = None
         else:
-            self._laid_out = self.placements | {one.node: one.map_from_node for one in found}
+            self._laid_out = known | {one.node: one.map_from_node for one in found}
         return found
 
     def _writing_ended(self) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Select, func, select, union
+from sqlalchemy import Connection, Select, func, select
 
 from engram.errors import MapCorruptError
 from engram.frontend.blobs import content_digest
@@ -31,8 +31,8 @@ from engram.graph.model import (
 from engram.graph.paths import Attempts
 from engram.maps.attempts import unpack
 from engram.maps.columns import Columns, read_columns
-from engram.maps.marks import counting, edge_key, is_removed, removed_measurements
-from engram.maps.records import MapContents, MapInfo, Revision
+from engram.maps.marks import edge_key, is_removed, removed_measurements
+from engram.maps.records import MapContents, Revision
 from engram.maps.rows import (
     Row,
     amendment_from_row,
@@ -194,37 +194,6 @@ def revision_from_row(row: Row) -> Revision:
     )
 
 
-def info(connection: Connection, view: View, *, size_bytes: int) -> MapInfo:
-    """Counts and sizes of the map, without reading all records."""
-    by_kind = dict.fromkeys(EdgeKind, 0)
-    mapped_m = 0.0
-    for row in _newest_edges(connection, view):
-        kind = EdgeKind(row["kind"])
-        by_kind[kind] += 1
-        if kind is EdgeKind.ODOMETRY:
-            mapped_m += transform_from_bytes(row["a_from_b"], f"edge {row['key']}").distance_m
-    used = union(
-        *(
-            view.select(table).with_only_columns(table.c.camera).order_by(None)
-            for table in (sessions, nodes)
-        )
-    )
-    counted = view.select(attempts).with_only_columns(func.sum(attempts.c.count)).order_by(None)
-    return MapInfo(
-        revision=view.at,
-        descriptor=descriptor_of(connection, view),
-        cameras=connection.execute(select(func.count()).select_from(used.subquery())).scalar_one(),
-        sessions=_count(connection, view.select(sessions)),
-        nodes=node_count(connection, view),
-        edges=sum(by_kind.values()),
-        edges_of_kind={str(kind): count for kind, count in by_kind.items() if count},
-        path_entries=_count(connection, _entry_places(view)),
-        attempts=int(connection.execute(counted).scalar() or 0),
-        mapped_m=mapped_m,
-        size_bytes=size_bytes,
-    )
-
-
 def node_count(connection: Connection, view: View) -> int:
     """Number of visible nodes."""
     return _count(connection, view.select(nodes))
@@ -377,16 +346,6 @@ def _camera_id(known: dict[int, StereoCamera], row: Row, what: str) -> CameraId:
     return known[row["camera"]].id
 
 
-def _newest_edges(connection: Connection, view: View) -> list[Row]:
-    """The newest edge of each (a, b, kind) that was not removed, in order of writing."""
-    newest: dict[tuple[int, int, str], Row] = {}
-    for row in view.rows(connection, edges):
-        key = (row["a"], row["b"], row["kind"])
-        newest.pop(key, None)
-        newest[key] = row
-    return counting(connection, view, list(newest.values()))
-
-
 def _edges(
     connection: Connection, view: View, node_keys: NDArray[np.int64], node_list: tuple[Node, ...]
 ) -> EdgeTable:
@@ -447,12 +406,6 @@ def _path_entries(
         PathEntry(path_ids[path], sequence, node_list[node].id, kinds[code], stamp_ns)
         for path, sequence, node, stamp_ns, code in zip(*columns, codes.tolist(), strict=True)
     )
-
-
-def _entry_places(view: View) -> Select[Any]:
-    """Path and sequence of the visible entries, once each: newer rows supersede older ones."""
-    seen = view.select(path_entries).order_by(None)
-    return seen.with_only_columns(path_entries.c.path, path_entries.c.sequence).distinct()
 
 
 def _attempts(

@@ -13,6 +13,7 @@ from engram.errors import MapCorruptError, RevisionError
 from engram.files import Holder
 from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, SessionId, path_id
 from engram.maps import reading
+from engram.maps.content import chained, content_hash
 from engram.maps.records import InterruptedSession, Revision, RevisionStatus, StoredSession
 from engram.maps.rows import (
     Row,
@@ -26,6 +27,7 @@ from engram.maps.rows import (
     transform_from_bytes,
     verified,
 )
+from engram.maps.runs import save_runs
 from engram.maps.schema import (
     VERSIONED,
     attempts,
@@ -38,9 +40,11 @@ from engram.maps.schema import (
     sessions,
     words,
 )
-from engram.maps.view import KeyBook, View, head, place_in_history
+from engram.maps.totals import Own, Totals, count_all, count_on, own_rows, state_at_head
+from engram.maps.view import LARGEST_KEY, KeyBook, View, head, place_in_history
 
-_ABANDONED = select(revisions.c.key).where(revisions.c.status == str(RevisionStatus.ABANDONED))
+# Ranges of a revision without rows.
+_NOTHING = to_json({})
 
 
 def new_revision(
@@ -62,6 +66,11 @@ def new_revision(
         "host": writer.host,
         "pid": writer.pid,
         "writer": writer.token,
+        "ranges": to_json(
+            {name: (first, LARGEST_KEY) for name, first in keys.first_keys(VERSIONED).items()}
+        ),
+        "totals": "{}",
+        "chain": "",
     }
 
 
@@ -70,7 +79,6 @@ def commit_revision(
     revision_key: int,
     *,
     was: RevisionStatus = RevisionStatus.OPEN,
-    contents: dict[str, float] | None = None,
     committed_ns: int | None = None,
 ) -> Revision:
     """Commits a revision and gives it its number.
@@ -79,26 +87,54 @@ def commit_revision(
         connection: in a transaction that includes this step.
         revision_key: key of its row.
         was: its status so far.
-        contents: `revision_contents` if known; None to count them here.
         committed_ns: when, UTC; None for now.
 
     Raises:
         RevisionError: it has another status.
     """
     parent = head(connection)
-    if contents is None:
-        contents = revision_contents(connection, revision_key)
-    change_revision(
-        connection,
-        revision_key,
-        was=was,
-        status=str(RevisionStatus.COMMITTED),
-        number=parent + 1,
-        parent=parent or None,
-        committed_ns=time.time_ns() if committed_ns is None else committed_ns,
-        contents=to_json(contents),
-    )
-    return reading.log(connection, View(parent + 1))[-1]
+    row = revision_row(connection, revision_key, was)
+    contents, own = brought(connection, row)
+    totals = _count_own(connection, parent, own)
+    row |= {
+        "status": str(RevisionStatus.COMMITTED),
+        "number": parent + 1,
+        "parent": parent or None,
+        "committed_ns": time.time_ns() if committed_ns is None else committed_ns,
+        "contents": to_json(contents),
+        "ranges": to_json(own.ranges),
+        "totals": totals.to_json(),
+    }
+    row["chain"] = chained(connection, content_hash(connection, parent), row, own)
+    _put(connection, row)
+    return reading.revision_from_row(row)
+
+
+def _count_own(connection: Connection, parent: int, own: Own) -> Totals:
+    """The totals with the rows of a revision; writes the runs."""
+    before, runs = state_at_head(connection, parent)
+    counted = None if runs is None else count_on(connection, View(parent), before, runs, own)
+    totals, after = counted or count_all(connection, View(parent, own.key))
+    save_runs(connection, runs, after)
+    return totals
+
+
+def revision_row(connection: Connection, key: int, status: RevisionStatus) -> Row:
+    """The row of a revision.
+
+    Raises:
+        RevisionError: it has another status.
+    """
+    found = connection.execute(select(revisions).where(revisions.c.key == key))
+    row = next(verified(revisions, found), None)
+    if row is None or row["status"] != status:
+        raise RevisionError(f"revision row {key} is not {status}")
+    return row
+
+
+def _put(connection: Connection, row: Row) -> None:
+    sealed(revisions, row)
+    connection.execute(update(revisions).where(revisions.c.key == row["key"]).values(row))
 
 
 def change_revision(
@@ -109,32 +145,37 @@ def change_revision(
     Raises:
         RevisionError: it has another status than `was`.
     """
-    found = connection.execute(select(revisions).where(revisions.c.key == key))
-    row = next(verified(revisions, found), None)
-    if row is None or row["status"] != was:
-        raise RevisionError(f"revision row {key} is not {was}")
-    row = sealed(revisions, {**row, **changes})
-    connection.execute(update(revisions).where(revisions.c.key == key).values(row))
+    _put(connection, revision_row(connection, key, was) | changes)
 
 
-def revision_contents(connection: Connection, revision_key: int) -> dict[str, float]:
-    """Number of rows that a revision added to each table, and metres of odometry edges."""
+def brought(connection: Connection, row: Row) -> tuple[dict[str, float], Own]:
+    """What a revision adds, given by its row.
+
+    Returns:
+        The number of its rows by table, and metres of odometry edges; and its rows, within the
+        least ranges of keys.
+    """
+    own = own_rows(row)
     contents: dict[str, float] = {}
+    ranges: dict[str, tuple[int, int]] = {}
     for table in VERSIONED:
-        rows = select(func.count()).select_from(table).where(table.c.revision == revision_key)
-        contents[table.name] = connection.execute(rows).scalar_one()
-    packed = select(func.sum(attempts.c.count)).where(attempts.c.revision == revision_key)
+        key = table.primary_key.columns[0]
+        query = select(func.count(), func.min(key), func.max(key)).where(own.rows(table))
+        contents[table.name], first, last = connection.execute(query).one()
+        if contents[table.name]:
+            ranges[table.name] = (first, last)
+    packed = select(func.sum(attempts.c.count)).where(own.rows(attempts))
     contents["attempts"] = int(connection.execute(packed).scalar() or 0)
     steps = (
         select(edges.c.a_from_b)
-        .where(edges.c.revision == revision_key, edges.c.kind == str(EdgeKind.ODOMETRY))
+        .where(own.rows(edges), edges.c.kind == str(EdgeKind.ODOMETRY))
         .order_by(edges.c.key)
     )
     contents["mapped_m"] = sum(
         transform_from_bytes(step, "odometry edge").distance_m
         for step in connection.execute(steps).scalars()
     )
-    return contents
+    return contents, Own(own.key, ranges)
 
 
 def changes_layout(contents: Mapping[str, float]) -> bool:
@@ -146,12 +187,20 @@ def changes_layout(contents: Mapping[str, float]) -> bool:
 
 def collect_abandoned(connection: Connection) -> int:
     """Removes the rows of abandoned revisions, but not their records; returns the number."""
-    lost = select(nodes.c.key).where(nodes.c.revision.in_(_ABANDONED))
-    connection.execute(delete(words).where(words.c.node.in_(lost)))  # keys may be reused
-    return sum(
-        connection.execute(delete(table).where(table.c.revision.in_(_ABANDONED))).rowcount
-        for table in reversed(VERSIONED)
+    query = select(revisions).where(
+        revisions.c.status == str(RevisionStatus.ABANDONED), revisions.c.ranges != _NOTHING
     )
+    found = 0
+    for row in list(verified(revisions, connection.execute(query.order_by(revisions.c.key)))):
+        own = own_rows(row)
+        lost = select(nodes.c.key).where(own.rows(nodes))
+        connection.execute(delete(words).where(words.c.node.in_(lost)))  # keys may be reused
+        found += sum(
+            connection.execute(delete(table).where(own.rows(table))).rowcount
+            for table in reversed(VERSIONED)
+        )
+        _put(connection, row | {"ranges": _NOTHING})
+    return found
 
 
 def session_and_revision(

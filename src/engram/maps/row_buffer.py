@@ -35,6 +35,7 @@ from engram.maps.schema import (
     vocabularies,
 )
 from engram.maps.sqlite import upsert
+from engram.maps.totals import Own
 from engram.maps.view import KeyBook
 
 # Bytes of a row as Python objects, without its blobs.
@@ -134,9 +135,9 @@ class RowBuffer:
         for session, tables in self._attempts.items():
             self._write_attempts(connection, session, tables)
 
-    def repack_attempts(self, connection: Connection) -> None:
+    def repack_attempts(self, connection: Connection, own: Own) -> None:
         """Packs attempts of all checkpoints together, so that the file does not depend on them."""
-        written = attempts.c.revision == self._revision_key
+        written = own.rows(attempts)
         found = connection.execute(select(attempts).where(written).order_by(attempts.c.key))
         tables: dict[int, list[Attempts]] = defaultdict(list)
         for row in verified(attempts, found):

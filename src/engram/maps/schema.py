@@ -22,7 +22,7 @@ from sqlalchemy import (
 from sqlalchemy.schema import SchemaItem
 from sqlalchemy.types import TypeEngine
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 
 # SQLite's INTEGER and REAL are 64 bits wide.
 _INT64: TypeEngine[int] = Integer()
@@ -73,6 +73,9 @@ revisions = _table(
     _text("host"),
     _int("pid"),
     _text("writer", "token of its lock"),
+    _text("ranges", "JSON: first and last key of its rows, by table"),
+    _text("totals", "JSON: what is visible as of it, below"),
+    _text("chain", "content hash as of it, below; empty until committed"),
     UniqueConstraint("number"),
 )
 
@@ -128,6 +131,7 @@ nodes = _table(
     _text("status", "of the frame"),
     _bytes("landmark_hash"),
     UniqueConstraint("uuid"),
+    Index("nodes_by_session", "session"),
 )
 
 # A separate table, so that reading the graph does not read the blobs.
@@ -149,6 +153,7 @@ edges = _table(
     _bytes("a_from_b", "transform"),
     _bytes("covariance", "168 bytes: upper triangle of the 6×6 row by row, float64"),
     UniqueConstraint("a", "b", "kind", "revision"),
+    Index("edges_by_b", "b"),
 )
 
 paths = _table(
@@ -171,6 +176,7 @@ path_entries = _table(
     _text("kind"),
     _int("stamp_ns"),
     UniqueConstraint("path", "sequence", "revision"),
+    Index("path_entries_by_node", "node"),
 )
 
 omissions = _table(
@@ -314,6 +320,16 @@ goals = _table(
     _text("name"),
     _int("node"),
     _bytes("node_from_goal", "transform"),
+)
+
+# Which nodes are connected as of the newest revision: runs of visible nodes, each by its first one.
+# They follow from other rows and belong to no revision.
+runs = _table(
+    "runs",
+    _key(),
+    _int("last", "node"),
+    _int("experience", "first node of the chain of odometry edges"),
+    _int("component", "first node of its connected component"),
 )
 
 # Rows refer to earlier tables only.

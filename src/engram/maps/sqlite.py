@@ -100,7 +100,7 @@ MAP_FILE = FileKind(
     metadata=metadata,
     strange=NotAMapError,
     cure="run engram check, and restore a copy",
-    older="map its drives again",
+    older="engram upgrade converts maps of format 6; map the drives of older ones again",
     busy_s=30.0,  # seconds; writers lock the file only for a checkpoint
 )
 # SQLite then takes no locks, and does not notice writes of other processes.
@@ -153,7 +153,7 @@ class SqliteDatabase:
                     write_format(connection)
                     file.mark(connection.exec_driver_sql)
                 engine.dispose()
-                _keep_log(file)
+                keep_log(file)
 
     @property
     def name(self) -> str:
@@ -260,7 +260,7 @@ class SqliteDatabase:
         with self._written_anew(target) as (source, draft):
             with closing(draft.connect("mode=rwc")) as copy:
                 source.backup(copy)
-            _keep_log(draft)
+            keep_log(draft)
 
     def compact_to(self, target: Path) -> None:
         """Rewrites the map atomically, without free pages.
@@ -271,7 +271,7 @@ class SqliteDatabase:
         """
         with self._written_anew(target) as (source, draft):
             source.execute("VACUUM INTO ?", [str(draft.path)])
-            _keep_log(draft)
+            keep_log(draft)
 
     @contextmanager
     def _written_anew(self, target: Path) -> Iterator[tuple[sqlite3.Connection, SqliteFile]]:
@@ -366,7 +366,7 @@ def _writing_engine(file: SqliteFile, options: str) -> Engine:
     return engine
 
 
-def _keep_log(file: SqliteFile) -> None:
+def keep_log(file: SqliteFile) -> None:
     """Switches the file to a write-ahead log permanently."""
     with closing(file.connect("mode=rw")) as connection:
         connection.execute("PRAGMA journal_mode=WAL")

@@ -1,4 +1,4 @@
-"""Tags of revisions, and where a map comes from."""
+"""Tags of revisions."""
 
 from __future__ import annotations
 
@@ -6,21 +6,12 @@ import re
 import time
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, func, insert, select
+from sqlalchemy import Connection, insert, select
 
 from engram.errors import InputError, RevisionError
-from engram.graph.model import NodeId, SessionId
-from engram.maps.rows import (
-    Row,
-    checked_text,
-    count_tags,
-    node_from_bytes,
-    sealed,
-    uuid_from_bytes,
-    verified,
-)
-from engram.maps.schema import hidden, nodes, revisions, sessions, tags
-from engram.maps.view import KeyBook, View, head, place_in_history
+from engram.maps.rows import checked_text, count_tags, sealed, verified
+from engram.maps.schema import tags
+from engram.maps.view import KeyBook, head
 
 HEAD = "head"
 # A letter first, so that no tag looks like a number or an option; no `~`, which means steps back.
@@ -168,90 +159,3 @@ def _check_tag(name: str) -> None:
             f"{name!r} cannot be a tag: a letter, then letters, digits and . _ / + -, 100 at "
             f"most, and not {HEAD!r}"
         )
-
-
-_HEX = frozenset("0123456789abcdef")
-_LISTED = 5
-
-
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """A node and its history.
-
-    Attributes:
-        node: its id.
-        session: of the drive that saved it.
-        robot: of that drive.
-        stamp_ns: of its frame.
-        driven_m: odometry distance from the session's start.
-        brought: number of the revision that added it.
-        told: (number, hidden) for each later revision that hid it or showed it again.
-    """
-
-    node: NodeId
-    session: SessionId
-    robot: str
-    stamp_ns: int
-    driven_m: float
-    brought: int
-    told: tuple[tuple[int, bool], ...]
-
-    @property
-    def visible(self) -> bool:
-        """Whether the node is visible at the chosen revision."""
-        return not (self.told and self.told[-1][1])
-
-
-def origin_of(connection: Connection, view: View, prefix: str) -> Origin:
-    """The one node whose UUID begins with `prefix`, hidden ones included.
-
-    Args:
-        connection: of the map.
-        view: the view of a revision.
-        prefix: hexadecimal digits, with or without hyphens.
-
-    Raises:
-        InputError: no node or several match, or the prefix is not valid.
-    """
-    digits = prefix.strip().lower().replace("-", "")
-    if not digits or not _HEX.issuperset(digits) or len(digits) > 32:
-        raise InputError(f"{prefix!r} is not a UUID or the beginning of one")
-    brought = nodes.c.revision.in_(view.revision_keys())
-    begins = _between(digits)
-    query = select(nodes).where(brought, nodes.c.uuid >= begins[0], nodes.c.uuid <= begins[1])
-    rows = list(verified(nodes, connection.execute(query.order_by(nodes.c.uuid))))
-    if not rows:
-        count = connection.execute(select(func.count()).select_from(nodes).where(brought)).scalar()
-        raise InputError(f"none of the map's {count} nodes begins with {prefix!r}")
-    if len(rows) > 1:
-        listed = ", ".join(str(node_from_bytes(row["uuid"])) for row in rows[:_LISTED])
-        more = f" and {len(rows) - _LISTED} more" if len(rows) > _LISTED else ""
-        raise InputError(f"{len(rows)} nodes begin with {prefix!r}, give more: {listed}{more}")
-    return _origin(connection, view, rows[0])
-
-
-def _between(digits: str) -> tuple[bytes, bytes]:
-    """The smallest and the largest UUID that begin with `prefix`."""
-    return bytes.fromhex(digits.ljust(32, "0")), bytes.fromhex(digits.ljust(32, "f"))
-
-
-def _origin(connection: Connection, view: View, row: Row) -> Origin:
-    number = select(revisions.c.number).where(revisions.c.key == row["revision"])
-    owner = select(sessions).where(sessions.c.key == row["session"])
-    session = next(verified(sessions, connection.execute(owner)))
-    told = (
-        select(revisions.c.number, hidden.c.hidden)
-        .select_from(hidden.join(revisions, revisions.c.key == hidden.c.revision))
-        .where(hidden.c.record == nodes.name, hidden.c.target == row["key"])
-        .where(hidden.c.revision.in_(view.revision_keys()))
-        .order_by(place_in_history(), hidden.c.key)
-    )
-    return Origin(
-        node=node_from_bytes(row["uuid"]),
-        session=SessionId(uuid_from_bytes(session["uuid"], "a session")),
-        robot=session["robot"],
-        stamp_ns=row["stamp_ns"],
-        driven_m=row["driven_m"],
-        brought=connection.execute(number).scalar_one(),
-        told=tuple((by, bool(hid)) for by, hid in connection.execute(told)),
-    )

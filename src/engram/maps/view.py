@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -158,6 +158,10 @@ class KeyBook:
             )
         self._next[table] = key + 1
         return key
+
+    def first_keys(self, tables: Iterable[Table]) -> dict[str, int]:
+        """The next key of each table, by name; that of a table without keys is its node's."""
+        return {table.name: self._next[table if table in self._next else nodes] for table in tables}
 
     def set_view(self, view: View) -> None:
         """Changes the visible revision."""

@@ -39,11 +39,12 @@ from engram.maps.marks import mark_row
 from engram.maps.records import Revision, RevisionStatus, StoredNode, StoredSession
 from engram.maps.references import References
 from engram.maps.revisions import (
+    brought,
     change_revision,
     changes_layout,
     commit_revision,
     open_sessions,
-    revision_contents,
+    revision_row,
 )
 from engram.maps.row_buffer import RowBuffer
 from engram.maps.rows import check_edge, checked_int, session_row, to_json, transform_bytes
@@ -64,6 +65,7 @@ from engram.maps.schema import (
     vocabularies,
 )
 from engram.maps.sqlite import SqliteDatabase
+from engram.maps.totals import Own, own_rows
 from engram.maps.view import KeyBook, View
 
 # Most bytes in memory of a revision that is not resumable.
@@ -105,8 +107,8 @@ class RevisionWriter:
         on_end: called after commit or abandonment.
         drive: the drive of a resumable revision; None for others.
         committed_ns: time of the commit to store, UTC, ns; None for the actual time.
-        places: gives, for the contents of the revision, the places in the map frame that it
-            changes; called before the commit.
+        places: gives, for the contents and the rows of the revision, the places in the map frame
+            that it changes; called before the commit.
 
     Attributes:
         resumable: whether it is of one drive.
@@ -123,7 +125,9 @@ class RevisionWriter:
         *,
         drive: Resumable | None = None,
         committed_ns: int | None = None,
-        places: Callable[[Mapping[str, float], PlacingConfig], Sequence[Mark]] = lambda *_: (),
+        places: Callable[[Mapping[str, float], Own, PlacingConfig], Sequence[Mark]] = (
+            lambda *_: ()
+        ),
     ) -> None:
         assert view.own is not None
         self.resumable = drive is not None
@@ -473,20 +477,20 @@ class RevisionWriter:
             StorageFullError: as `checkpoint`.
         """
         self.checkpoint()
-        contents = self._contents()
+        with self._database.reading() as connection:
+            row = revision_row(connection, self._revision_key, self._status)
+            contents, own = brought(connection, row)
         if changes_layout(contents):
-            for one in self._places(contents, placing):
+            for one in self._places(contents, own, placing):
                 self.add_mark(one)
             self.checkpoint()
-            contents = self._contents()
         with self._database.writing() as connection:
             if self.resumable:
-                self._rows.repack_attempts(connection)
+                self._rows.repack_attempts(connection, own_rows(row))
             revision = commit_revision(
                 connection,
                 self._revision_key,
                 was=self._status,
-                contents=contents,
                 committed_ns=self._committed_ns,
             )
         self._end()
@@ -522,10 +526,6 @@ class RevisionWriter:
             self.abandon()
 
     # -- inside
-
-    def _contents(self) -> dict[str, float]:
-        with self._database.reading() as connection:
-            return revision_contents(connection, self._revision_key)
 
     def _end(self) -> None:
         self._ended = True

@@ -30,8 +30,7 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
         MapError: the map cannot be read.
     """
     with Map.open(path, at=at) as store:
-        info = store.info()
-        components = Counter(store.graph.components().tolist())
+        info, totals = store.info(), store.totals()
         return {
             "format_version": FORMAT_VERSION,
             "revision": info.revision,
@@ -41,11 +40,11 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
             "robots": sorted({session.robot for session in store.sessions.values()}),
             "cameras": info.cameras,
             "nodes": info.nodes,
-            "experiences": len(set(store.graph.experiences.tolist())),
+            "experiences": totals.experiences,
             "edges": dict(info.edges_of_kind),
-            "components": len(components),
-            "largest_component": max(components.values(), default=0),
-            "paths": len(store.path_memory),
+            "components": totals.components,
+            "largest_component": totals.largest_component,
+            "paths": totals.paths,
             "path_entries": info.path_entries,
             "attempts": info.attempts,
             "mapped_m": info.mapped_m,

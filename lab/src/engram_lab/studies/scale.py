@@ -41,6 +41,8 @@ from engram.maps import schema
 from engram.maps.attempts import encode_words, pack
 from engram.maps.map import Map
 from engram.maps.rows import camera_row, covariance_bytes, session_row, to_json, transform_bytes
+from engram.maps.sqlite import SqliteDatabase
+from engram.maps.upgrading import complete_history
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.places.vocabulary import Vocabulary, default_vocabulary, hash_of
 from engram.sequences.sequence import LoggedFrame
@@ -133,9 +135,9 @@ class City:
                 rows.write_street(street)
                 if street % 10 == 9:
                     database.commit()
-            rows.index()
             database.commit()
-            database.execute("PRAGMA wal_checkpoint(truncate)")
+        with closing(SqliteDatabase(path)) as made, made.writing() as connection:
+            complete_history(connection)
 
 
 _AHEAD = OdometryStep(
@@ -194,24 +196,11 @@ class _Rows:
             host="",
             pid=1,
             writer="",
+            ranges="{}",
+            totals="{}",
+            chain="",
         )
         self._write()
-
-    def index(self) -> None:
-        """Adds the indices that a map by pages is read with, where its format has none."""
-        for table, column in (("edges", "b"), ("path_entries", "node"), ("nodes", "session")):
-            indexed = (
-                found[0]
-                for (name,) in self._database.execute(
-                    "SELECT name FROM sqlite_schema WHERE type = 'index' AND tbl_name = ?", (table,)
-                ).fetchall()
-                for found in self._database.execute(
-                    "SELECT name FROM pragma_index_info(?) WHERE seqno = 0", (name,)
-                ).fetchall()
-            )
-            if column not in indexed:
-                name = f"{table}_by_{column}"
-                self._database.execute(f"CREATE INDEX {name} ON {table} ({column})")
 
     def _write_drive(self, revision: int, street: int, lane: int, first: int) -> None:
         made, length = self._city.drive(street, lane), self._city.length

@@ -1,6 +1,6 @@
-"""Writes `format-6.engram`. Run it only while format 6 is the newest.
+"""Writes `format-7.engram`. Run it only while format 7 is the newest.
 
-    python -m tests.maps.data.make_format_6 FILE
+    python -m tests.maps.data.make_map FILE
 
 One map with a row of every kind: two drives, the second reverted and mapped again, one that was
 interrupted, a superseded edge, an omission, an amendment, marks, words and tags.

@@ -1,0 +1,134 @@
+"""Where the nodes of an open revision come to lie, from its own rows and the ends of its edges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from sqlalchemy import Connection, select
+
+from engram.geometry.se3 import SE3
+from engram.graph.model import Edge, Node, NodeId, Placement
+from engram.graph.placing import PlacingConfig, Surroundings, place
+from engram.maps.map_frame import changed, graph_of
+from engram.maps.reading import load_cameras
+from engram.maps.rows import (
+    Row,
+    edges_from_rows,
+    node_from_row,
+    session_from_row,
+    transform_from_bytes,
+    verified,
+)
+from engram.maps.runs import Keys, Runs
+from engram.maps.schema import edges, nodes, placements, revisions, sessions
+from engram.maps.totals import Own, Totals, state_at_head, supersedes
+from engram.maps.view import View, place_in_history
+
+# Keys in one statement.
+_FEW = 500
+
+
+def new_places(
+    connection: Connection,
+    view: View,
+    contents: Mapping[str, float],
+    own: Own,
+    config: PlacingConfig,
+) -> list[Placement] | None:
+    """The places of the new nodes of an open revision, as a layout of the whole map has them.
+
+    Args:
+        connection: of the map.
+        view: the newest revision and the open one.
+        contents: number of rows of the open revision, by table.
+        own: its rows.
+        config: how new nodes are laid out.
+
+    Returns:
+        None if what has a place may have to move: parts come together, edges go, or places are
+        given.
+    """
+    if any(contents[name] for name in ("placements", "hidden", "removals")):
+        return None
+    totals, runs = state_at_head(connection, view.at)
+    if runs is None or supersedes(connection, view, own):
+        return None
+    fresh, joins = (
+        list(verified(table, connection.execute(query.order_by(table.c.key))))
+        for table, query in ((one, select(one).where(own.rows(one))) for one in (nodes, edges))
+    )
+    ends = np.array([(row["a"], row["b"]) for row in joins], np.int64).reshape(-1, 2)
+    new = np.array([row["key"] for row in fresh], np.int64)
+    old = np.setdiff1d(ends, new)
+    if _brings_together(runs, new, ends):
+        return None
+    if not len(new):
+        return []
+    known = _older(connection, view, old)
+    placed = _places(connection, view, [row["key"] for row in known])
+    if (runs.find(old) < 0).any() or len(placed) < len(old):
+        return None
+    records = _nodes(connection, [*known, *fresh])
+    by_key = dict(zip((row["key"] for row in (*known, *fresh)), records, strict=True))
+    graph = graph_of(records, _edges(joins, by_key))
+    before = {by_key[key].id: pose for key, pose in placed.items()}
+    rest = _rest(totals, runs, np.array([row["key"] for row in known], np.int64))
+    return changed(before, graph, place(graph, before, config, rest), config.same_m)
+
+
+def _brings_together(runs: Runs, new: Keys, ends: Keys) -> bool:
+    """Whether edges join components that were apart."""
+    if (runs.find(np.setdiff1d(ends, new)) < 0).any():
+        return True
+    after = runs.with_nodes(new).joined(np.zeros((0, 2), np.int64), ends)
+    left = after.component[after.find(runs.first)]
+    return len(np.unique(left)) < len(np.unique(runs.component))
+
+
+def _rest(totals: Totals, runs: Runs, placed: Keys) -> Surroundings:
+    """What the layout has to know of the map, whose nodes with a place (P,) come first."""
+    component = runs.component[runs.find(placed)]
+    _, first, which = np.unique(component, return_index=True, return_inverse=True)
+    held = np.column_stack([first[which], np.arange(len(placed))]).reshape(-1, 2)
+    forward = {str(camera): np.array(shift) for camera, shift in totals.forward.items()}
+    return Surroundings(held, forward, totals.right_m)
+
+
+def _older(connection: Connection, view: View, keys: Keys) -> list[Row]:
+    """Rows of nodes of earlier revisions, in the order of a graph that is read."""
+    found: list[Row] = []
+    for at in range(0, len(keys), _FEW):
+        query = view.select(nodes).where(nodes.c.key.in_(keys[at : at + _FEW].tolist()))
+        found += verified(nodes, connection.execute(query))
+    order = select(revisions.c.key, place_in_history()).order_by(revisions.c.key)
+    place_of = dict(map(tuple, connection.execute(order)))
+    return sorted(found, key=lambda row: (place_of[row["revision"]], row["key"]))
+
+
+def _places(connection: Connection, view: View, keys: list[int]) -> dict[int, SE3]:
+    """The newest place of each node that has one."""
+    found = {}
+    for at in range(0, len(keys), _FEW):
+        query = view.select(placements).where(placements.c.node.in_(keys[at : at + _FEW]))
+        for row in verified(placements, connection.execute(query)):
+            found[row["node"]] = transform_from_bytes(row["map_from_node"], "a placement")
+    return found
+
+
+def _nodes(connection: Connection, rows: list[Row]) -> list[Node]:
+    cameras = load_cameras(connection)
+    wanted = sorted({row["session"] for row in rows})
+    drives = {}
+    for at in range(0, len(wanted), _FEW):
+        query = select(sessions).where(sessions.c.key.in_(wanted[at : at + _FEW]))
+        for row in verified(sessions, connection.execute(query.order_by(sessions.c.key))):
+            drives[row["key"]] = session_from_row(row, cameras[row["camera"]].id).id
+    return [node_from_row(row, drives[row["session"]], cameras[row["camera"]].id) for row in rows]
+
+
+def _edges(rows: list[Row], nodes_by_key: Mapping[int, Node]) -> tuple[Edge, ...]:
+    def named(key: int) -> NodeId:
+        return nodes_by_key[key].id
+
+    return edges_from_rows(rows, [(named(row["a"]), named(row["b"])) for row in rows])

@@ -1,0 +1,442 @@
+"""What is visible as of a revision, in numbers: counted on from those of the revision before.
+
+A revision that only adds is counted by its own rows. One that hides, removes, moves or supersedes
+is counted with the whole map, in stretches of its rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import ColumnElement, Connection, Select, Table, and_, func, or_, select
+
+from engram.errors import MapCorruptError
+from engram.geometry.cameras import CameraId
+from engram.graph.model import EdgeKind
+from engram.maps.columns import Columns, read_columns
+from engram.maps.marks import counting
+from engram.maps.reading import descriptor_of, load_cameras
+from engram.maps.records import MapInfo
+from engram.maps.rows import Row, verified
+from engram.maps.runs import Keys, Runs, load_runs
+from engram.maps.schema import (
+    attempts,
+    edges,
+    nodes,
+    path_entries,
+    paths,
+    placements,
+    removals,
+    revisions,
+    sessions,
+)
+from engram.maps.view import LARGEST_KEY, View, place_in_history
+
+_EDGE_BYTES = {"a_from_b": 96, "covariance": 168}
+_NODE_BYTES = {"uuid": 16, "landmark_hash": 16}
+# Rows read at once.
+_AT_ONCE = 100_000
+# Keys in one statement.
+_FEW = 500
+
+_Key = Annotated[int, msgspec.Meta(ge=0, le=LARGEST_KEY)]
+Forward = Mapping[CameraId, tuple[float, float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Totals:
+    """What a map holds as of a revision.
+
+    Attributes:
+        cameras: ids of the cameras of visible sessions and nodes, rising.
+        sessions, nodes, paths, path_entries, attempts: number of visible ones.
+        edges: number of visible edges by kind, of kinds that have any.
+        mapped_m: length of the odometry edges, metres.
+        experiences: number of chains of odometry edges within drives.
+        components, largest_component: number of connected components, and of nodes of the largest.
+        forward: sum of the translations of the odometry edges of each camera, metres: where it
+            looks.
+        right_m: largest x of a stored place in the map frame; None if there is none.
+    """
+
+    cameras: tuple[CameraId, ...] = ()
+    sessions: int = 0
+    nodes: int = 0
+    paths: int = 0
+    path_entries: int = 0
+    attempts: int = 0
+    edges: Mapping[str, int] = field(default_factory=dict)
+    mapped_m: float = 0.0
+    experiences: int = 0
+    components: int = 0
+    largest_component: int = 0
+    forward: Forward = field(default_factory=dict)
+    right_m: float | None = None
+
+    @staticmethod
+    def from_json(text: str, what: str) -> Totals:
+        """Undoes `to_json`."""
+        try:
+            return msgspec.json.decode(text, type=Totals)
+        except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
+            raise MapCorruptError(f"{what}: its totals are malformed: {error}") from error
+
+    def to_json(self) -> str:
+        """As stored."""
+        return msgspec.json.encode(self, order="sorted").decode()
+
+    def agrees(self, other: Totals) -> bool:
+        """Whether they are equal, but for the rounding of sums and of places."""
+        (exact, rough), (its_exact, its_rough) = self._parts(), other._parts()
+        return exact == its_exact and np.allclose(rough, its_rough)
+
+    def _parts(self) -> tuple[Totals, list[float]]:
+        cameras = sorted(self.forward)
+        rough = [self.mapped_m, self.right_m or 0.0]
+        rough += [shift_m for camera in cameras for shift_m in self.forward[camera]]
+        nowhere = dict.fromkeys(cameras, (0.0,) * 3)
+        return replace(self, mapped_m=0.0, right_m=None, forward=nowhere), rough
+
+    def of_runs(self, runs: Runs) -> Totals:
+        """With the numbers that follow from the runs."""
+        return replace(
+            self,
+            nodes=int(runs.sizes.sum()),
+            experiences=len(np.unique(runs.experience)),
+            components=len(np.unique(runs.component)),
+            largest_component=runs.largest,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Own:
+    """The rows of a revision.
+
+    Attributes:
+        key: of the revision.
+        ranges: first and last key of its rows by table, of tables of which it has rows.
+    """
+
+    key: int
+    ranges: Mapping[str, tuple[int, int]]
+
+    def rows(self, table: Table) -> ColumnElement[bool]:
+        """The condition that a row is one of them."""
+        first, last = self.ranges.get(table.name, (0, -1))
+        key = table.primary_key.columns[0]
+        return key.between(first, last) & (table.c.revision == self.key)
+
+    def columns(
+        self, connection: Connection, table: Table, sizes: Mapping[str, int] | None = None
+    ) -> Columns:
+        """Those of one table, verified."""
+        view, within = View(0, self.key), self.ranges.get(table.name, (0, -1))
+        return read_columns(connection, view, table, sizes, within=within)
+
+
+def own_rows(row: Row) -> Own:
+    """The rows of a revision, given by its row.
+
+    Raises:
+        MapCorruptError: its ranges are malformed.
+    """
+    try:
+        ranges = msgspec.json.decode(row["ranges"], type=dict[str, tuple[_Key, _Key]])
+    except (msgspec.DecodeError, UnicodeError, RecursionError) as error:
+        raise MapCorruptError(f"revision row {row['key']}: malformed ranges: {error}") from error
+    return Own(row["key"], ranges)
+
+
+def totals_at(connection: Connection, number: int) -> Totals:
+    """The stored totals as of a committed revision; 0 for the map before the first."""
+    if not number:
+        return Totals()
+    query = select(revisions).where(revisions.c.number == number)
+    row = next(verified(revisions, connection.execute(query)))
+    return Totals.from_json(row["totals"], f"revision {number}")
+
+
+def totals_of(connection: Connection, view: View) -> Totals:
+    """The totals of a view: as stored, but for an open revision, of which all is counted."""
+    return totals_at(connection, view.at) if view.own is None else count_all(connection, view)[0]
+
+
+def info(connection: Connection, view: View, *, size_bytes: int) -> MapInfo:
+    """Counts and sizes of the map."""
+    found = totals_of(connection, view)
+    return MapInfo(
+        revision=view.at,
+        descriptor=descriptor_of(connection, view),
+        cameras=len(found.cameras),
+        sessions=found.sessions,
+        nodes=found.nodes,
+        edges=sum(found.edges.values()),
+        edges_of_kind={str(kind): found.edges[kind] for kind in EdgeKind if kind in found.edges},
+        path_entries=found.path_entries,
+        attempts=found.attempts,
+        mapped_m=found.mapped_m,
+        size_bytes=size_bytes,
+    )
+
+
+def state_at_head(connection: Connection, head: int) -> tuple[Totals, Runs | None]:
+    """The totals and runs as of the newest revision; None for runs that do not fit."""
+    totals, runs = totals_at(connection, head), load_runs(connection)
+    fits = runs is not None and int(runs.sizes.sum()) == totals.nodes
+    return totals, runs if fits else None
+
+
+def count_all(connection: Connection, view: View) -> tuple[Totals, Runs]:
+    """The totals of a view, from all its rows, and its runs."""
+    seen = view.select(attempts).with_only_columns(func.sum(attempts.c.count)).order_by(None)
+    entries = view.select(path_entries).order_by(None)
+    places = entries.with_only_columns(path_entries.c.path, path_entries.c.sequence).distinct()
+    found = Totals(
+        cameras=_cameras(connection, *(view.select(one) for one in (sessions, nodes))),
+        sessions=_count(connection, view.select(sessions)),
+        paths=_count(connection, view.select(paths)),
+        path_entries=_count(connection, places),
+        attempts=int(connection.execute(seen).scalar() or 0),
+        right_m=_right_m(connection, view),
+    )
+    known = [
+        (part["key"], part["session"], part["camera"])
+        for part in _stretches(connection, view, nodes, _NODE_BYTES)
+    ]
+    owners = _Owners(connection, *(np.concatenate(part) for part in zip(*known, strict=True)))
+    runs = Runs.of(owners.nodes)
+    skipped = np.array(sorted(_uncounted(connection, view)), np.int64)
+    for part in _stretches(connection, view, edges, _EDGE_BYTES):
+        found, runs = _with_edges(found, runs, part, skipped, owners)
+    return found.of_runs(runs), runs
+
+
+def count_on(
+    connection: Connection, view: View, before: Totals, runs: Runs, own: Own
+) -> tuple[Totals, Runs] | None:
+    """The totals after a revision that only adds; None if it does anything else.
+
+    Args:
+        connection: of the map.
+        view: the revision before.
+        before: the totals as of the revision before.
+        runs: its runs.
+        own: the rows of this revision.
+    """
+    if {"hidden", "removals"} & own.ranges.keys():
+        return None
+    fresh = own.columns(connection, nodes, _NODE_BYTES)
+    placed = own.columns(connection, placements, {"map_from_node": 96})
+    if not np.isin(placed["node"], fresh["key"]).all() or supersedes(connection, view, own):
+        return None
+    count = {table.name: _own_count(connection, own, table) for table in _COUNTED}
+    made = select(func.sum(attempts.c.count)).where(own.rows(attempts))
+    x_m = placed["map_from_node"].view("<f8")[:, 9]
+    seen = _cameras(connection, *(select(one).where(own.rows(one)) for one in (sessions, nodes)))
+    found = replace(
+        before,
+        cameras=tuple(sorted({*before.cameras, *seen})),
+        sessions=before.sessions + count[sessions.name],
+        paths=before.paths + count[paths.name],
+        path_entries=before.path_entries + count[path_entries.name],
+        attempts=before.attempts + int(connection.execute(made).scalar() or 0),
+        right_m=_greater(before.right_m, x_m),
+    )
+    owners = _Owners(connection, fresh["key"], fresh["session"], fresh["camera"])
+    added = own.columns(connection, edges, _EDGE_BYTES)
+    nothing = np.zeros(0, np.int64)
+    found, runs = _with_edges(found, runs.with_nodes(fresh["key"]), added, nothing, owners)
+    return found.of_runs(runs), runs
+
+
+_COUNTED = (sessions, paths, path_entries)
+
+
+def _cameras(connection: Connection, *rows: Select[Any]) -> tuple[CameraId, ...]:
+    """Ids of the cameras of rows of sessions or nodes, rising."""
+    known = load_cameras(connection)
+    keys = set()
+    for query in rows:
+        camera = query.selected_columns["camera"]
+        used = query.with_only_columns(camera).order_by(None).distinct()
+        keys |= set(connection.execute(used).scalars())
+    if missing := keys - known.keys():
+        raise MapCorruptError(f"table cameras: row {min(missing)}, which others use, is missing")
+    return tuple(sorted(known[key].id for key in keys))
+
+
+class _Owners:
+    """The session and the camera of nodes: of given ones, and of others by a look-up.
+
+    Args:
+        connection: of the map.
+        nodes: (N,) keys, ascending.
+        sessions, cameras: (N,) keys.
+    """
+
+    def __init__(self, connection: Connection, nodes: Keys, sessions: Keys, cameras: Keys) -> None:
+        self._connection = connection
+        self.nodes = nodes
+        self._values = np.column_stack([sessions, cameras]).reshape(-1, 2)
+        self.cameras = {key: one.id for key, one in load_cameras(connection).items()}
+
+    def of(self, keys: Keys) -> Keys:
+        """(K, 2) the session and the camera of each node."""
+        wanted = np.unique(keys)
+        self._learn(wanted[~np.isin(wanted, self.nodes)])
+        return self._values[np.searchsorted(self.nodes, keys)]
+
+    def _learn(self, keys: Keys) -> None:
+        """Looks up nodes.
+
+        Raises:
+            MapCorruptError: one is missing.
+        """
+        rows = []
+        for at in range(0, len(keys), _FEW):
+            query = select(nodes).where(nodes.c.key.in_(keys[at : at + _FEW].tolist()))
+            found = verified(nodes, self._connection.execute(query.order_by(nodes.c.key)))
+            rows += [(row["key"], row["session"], row["camera"]) for row in found]
+        if len(rows) != len(keys):
+            raise MapCorruptError(f"{len(keys) - len(rows)} nodes of edges are missing")
+        if rows:
+            known = np.array(rows, np.int64)
+            every = np.concatenate([self.nodes, known[:, 0]])
+            order = np.argsort(every)
+            self.nodes = every[order]
+            self._values = np.concatenate([self._values, known[:, 1:]])[order]
+
+
+def _with_edges(
+    before: Totals, runs: Runs, added: Columns, skipped: Keys, owners: _Owners
+) -> tuple[Totals, Runs]:
+    """The totals and runs with these edges, but for those with the keys `skipped`."""
+    chosen = np.flatnonzero(~np.isin(added["key"], skipped))
+    added = added.rows(chosen)
+    codes, texts = added.texts["kind"]
+    ends = np.column_stack([added["a"], added["b"]]).reshape(-1, 2)
+    by_kind = dict(before.edges)
+    for code, count in enumerate(np.bincount(codes, minlength=len(texts)).tolist()):
+        if count:
+            by_kind[texts[code]] = by_kind.get(texts[code], 0) + count
+    odometry = [at for at, text in enumerate(texts) if text == EdgeKind.ODOMETRY]
+    steps = np.flatnonzero(np.isin(codes, odometry))
+    shifts = added["a_from_b"][steps].view("<f8")[:, 9:]
+    sessions_of, cameras_of = owners.of(ends[steps].ravel()).reshape(-1, 2, 2).transpose(2, 0, 1)
+    forward = {key: np.array(value) for key, value in before.forward.items()}
+    mapped_m = before.mapped_m
+    # One after the other: sums then do not depend on where one commit ends.
+    for camera, shift in zip(cameras_of[:, 1].tolist(), shifts, strict=True):
+        mapped_m += float(np.sqrt(shift @ shift))
+        known = forward.setdefault(owners.cameras[camera], np.zeros(3))
+        known += shift
+    chained = ends[steps][sessions_of[:, 0] == sessions_of[:, 1]]
+    totals = replace(
+        before,
+        edges=by_kind,
+        mapped_m=mapped_m,
+        forward={key: tuple(value.tolist()) for key, value in forward.items()},
+    )
+    return totals, runs.joined(chained, ends)
+
+
+def _stretches(
+    connection: Connection, view: View, table: Table, sizes: Mapping[str, int]
+) -> Iterator[Columns]:
+    """The visible rows of a table by key, so many at once; one stretch at least."""
+    key = table.primary_key.columns[0]
+    last = connection.execute(select(func.max(key))).scalar() or 0
+    start = connection.execute(select(func.min(key))).scalar() or 0
+    while True:
+        query = select(key).where(key >= start).order_by(key).offset(_AT_ONCE - 1).limit(1)
+        end = connection.execute(query).scalar()
+        stop = last if end is None else end
+        yield read_columns(connection, view, table, sizes, within=(start, stop))
+        if stop >= last:
+            return
+        start = stop + 1
+
+
+def _uncounted(connection: Connection, view: View) -> set[int]:
+    """Keys of visible edges that do not count: superseded, or removed."""
+    named = (edges.c.a, edges.c.b, edges.c.kind)
+    doubled = select(*named).group_by(*named).having(func.count() > 1).order_by(*named)
+    found = set()
+    for a, b, kind in connection.execute(doubled).fetchall():
+        same = view.select(edges).where(edges.c.a == a, edges.c.b == b, edges.c.kind == kind)
+        found |= {row["key"] for row in list(verified(edges, connection.execute(same)))[:-1]}
+    for removal in view.rows(connection, removals):
+        between = or_(*(and_(edges.c.a == a, edges.c.b == b) for a, b in _both_ways(removal)))
+        rows = list(verified(edges, connection.execute(view.select(edges).where(between))))
+        found |= {row["key"] for row in rows}
+        found -= {row["key"] for row in counting(connection, view, rows)}
+    return found
+
+
+def _both_ways(row: Row) -> tuple[tuple[int, int], tuple[int, int]]:
+    return (row["a"], row["b"]), (row["b"], row["a"])
+
+
+def supersedes(connection: Connection, view: View, own: Own) -> bool:
+    """Whether a row of a revision may take the place of one of `view`, or is removed there."""
+    older = select(revisions.c.key).where(revisions.c.number <= view.at)
+    for table, names in ((edges, ("a", "b", "kind")), (path_entries, ("path", "sequence"))):
+        other = table.alias()
+        same = and_(*(other.c[name] == table.c[name] for name in names))
+        query = select(other.c.key).select_from(table.join(other, same))
+        query = query.where(own.rows(table), other.c.revision.in_(older)).limit(1)
+        if connection.execute(query).first() is not None:
+            return True
+    removed = select(removals.c.a, removals.c.b).where(removals.c.revision.in_(older))
+    ends = [(row.a, row.b) for row in connection.execute(removed.order_by(removals.c.key))]
+    for a, b in {*ends, *((b, a) for a, b in ends)}:
+        query = select(edges.c.key).where(edges.c.a == a, edges.c.b == b, own.rows(edges)).limit(1)
+        if connection.execute(query).first() is not None:
+            return True
+    return False
+
+
+def _right_m(connection: Connection, view: View) -> float | None:
+    """The largest x of the newest place of each node."""
+    parts = [
+        (part["node"], part["revision"], part["key"], part["map_from_node"].view("<f8")[:, 9])
+        for part in _stretches(connection, view, placements, {"map_from_node": 96})
+    ]
+    node, revision, key, x_m = (np.concatenate(one) for one in zip(*parts, strict=True))
+    place = _places(connection, view, revision)
+    order = np.lexsort((key, place, node))
+    newest = np.flatnonzero(np.diff(node[order], append=-1))
+    return _greater(None, x_m[order][newest])
+
+
+def _places(connection: Connection, view: View, revision: Keys) -> Keys:
+    """(N,) places in history of the revisions with these keys."""
+    query = select(revisions.c.key, place_in_history()).where(
+        revisions.c.key.in_(view.revision_keys())
+    )
+    place_of = dict(map(tuple, connection.execute(query)))
+    known, which = np.unique(revision, return_inverse=True)
+    return np.array([place_of[key] for key in known.tolist()], np.int64)[which]
+
+
+def _greater(known: float | None, values: NDArray[np.float64]) -> float | None:
+    if not len(values):
+        return known
+    most = float(values.max())
+    return most if known is None else max(known, most)
+
+
+def _own_count(connection: Connection, own: Own, table: Table) -> int:
+    query = select(func.count()).select_from(table).where(own.rows(table))
+    return connection.execute(query).scalar_one()
+
+
+def _count(connection: Connection, rows: Select[Any]) -> int:
+    return connection.execute(
+        select(func.count()).select_from(rows.order_by(None).subquery())
+    ).scalar_one()

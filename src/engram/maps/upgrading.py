@@ -1,0 +1,267 @@
+"""Converts a map of format 6: the same rows, with what format 7 adds to them.
+
+The new file is written next to the old one, compared with it row by row, and takes its name in one
+step. Whenever the process ends, one sound map has the name; the same command begins again.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sqlalchemy import Connection, MetaData, Table, func, insert, select, text
+
+from engram.errors import MapCorruptError, MapError, MapLockedError
+from engram.files import WriterLock, draft_folder
+from engram.maps.content import EMPTY_HASH, Identities, chained
+from engram.maps.map_files import log_problems
+from engram.maps.rows import Row, sealed, to_json, verified
+from engram.maps.runs import Runs, save_runs
+from engram.maps.schema import FORMAT_VERSION, VERSIONED, map_format, metadata, revisions, runs
+from engram.maps.sqlite import MAP_FILE, keep_log, write_format
+from engram.maps.totals import Own, Totals, count_all, count_on
+from engram.maps.view import LARGEST_KEY, View
+from engram.sqlite import SqliteFile, is_full
+
+_NEW_COLUMNS = ("ranges", "totals", "chain")
+_NEW_TABLES = (runs,)
+_OLD_NAME = "revisions_6"
+# How long to wait for a process that is just closing the map.
+_PATIENCE_MS = 1000
+
+
+def _format_6() -> MetaData:
+    """The tables of format 6."""
+    old = MetaData()
+    for table in metadata.sorted_tables:
+        if table not in _NEW_TABLES:
+            kept = [one for one in table.columns if one.name not in _NEW_COLUMNS]
+            Table(table.name, old, *(one._copy() for one in kept))
+    return old
+
+
+_FORMAT_6 = replace(MAP_FILE, format_version=6, metadata=_format_6())
+
+
+@dataclass(frozen=True, slots=True)
+class Upgraded:
+    """The result of an upgrade.
+
+    Attributes:
+        before, after: format of the file.
+        revisions: number of revisions.
+        rows: number of rows that were compared.
+        before_bytes, after_bytes: size of the file.
+    """
+
+    before: int
+    after: int
+    revisions: int
+    rows: int
+    before_bytes: int
+    after_bytes: int
+
+
+def upgrade_map(path: Path) -> Upgraded:
+    """Converts a map of format 6 to this format; one that has it stays as it is.
+
+    Raises:
+        NotAMapError: the file is not a map.
+        FormatVersionError: it is of another format.
+        MapCorruptError: it is damaged.
+        MapLockedError: another process has it open.
+        StorageFullError: no space for the copy; the map is unchanged.
+        MapError: the file or its folder cannot be written.
+    """
+    path = path.resolve()
+    file = SqliteFile(path, _FORMAT_6)
+    file.check_regular()
+    if not os.access(path, os.W_OK):
+        raise MapError(f"{path} is read-only; copy it to a writable folder")
+    lock = WriterLock(path)
+    try:
+        if _version(file) == FORMAT_VERSION:
+            size = path.stat().st_size
+            return Upgraded(FORMAT_VERSION, FORMAT_VERSION, 0, 0, size, size)
+        for fact in log_problems(path):
+            raise MapCorruptError(f"{path}: {fact}; restore a copy")
+        with _to_itself(file) as source, draft_folder(path) as folder:
+            return _upgraded(source, path, folder / path.name)
+    finally:
+        lock.release()
+
+
+def _upgraded(source: sqlite3.Connection, path: Path, draft: Path) -> Upgraded:
+    before = path.stat().st_size
+    old = SqliteFile(draft, _FORMAT_6)
+    with old.errors(), closing(old.connect("mode=rwc")) as copy:
+        source.backup(copy)
+    shutil.copymode(path, draft)
+    new = SqliteFile(draft, MAP_FILE)
+    with new.errors():
+        engine = new.engine("mode=rw", _without_log)
+        with engine.begin() as connection:
+            count = _convert(connection, new)
+        engine.dispose()
+        with closing(new.connect("mode=ro")) as made:
+            rows = _compare(source, made)
+        keep_log(new)
+    _sync(draft)
+    draft.replace(path)
+    _sync(path.parent)
+    return Upgraded(6, FORMAT_VERSION, count, rows, before, path.stat().st_size)
+
+
+def _version(file: SqliteFile) -> int:
+    """The format of a map: 6, or this one."""
+    with file.errors(), closing(file.connect("mode=rw")) as connection:
+        (version,) = connection.execute("PRAGMA user_version").fetchone()
+        kind = MAP_FILE if version == FORMAT_VERSION else _FORMAT_6
+        SqliteFile(file.path, replace(kind, older=MAP_FILE.older)).identify(connection.execute)
+        SqliteFile(file.path, kind).check_tables(connection.execute)
+    return int(version)
+
+
+@contextmanager
+def _to_itself(file: SqliteFile) -> Iterator[sqlite3.Connection]:
+    """A connection to a map that no other process has open, and that has no log.
+
+    A process that had it open would remove the log of the new file when it ends.
+    """
+    with file.errors(), closing(file.connect("mode=rw")) as connection:
+        connection.execute(f"PRAGMA busy_timeout={_PATIENCE_MS}")
+        try:
+            connection.execute("PRAGMA journal_mode=DELETE")
+        except sqlite3.OperationalError as error:
+            if is_full(error):
+                raise
+            raise MapLockedError(
+                f"{file.path} is open in another process; close it there first"
+            ) from error
+        try:
+            yield connection
+        except BaseException:
+            connection.execute("PRAGMA journal_mode=WAL")
+            raise
+
+
+def _without_log(connection: sqlite3.Connection) -> None:
+    """Of a draft, which is thrown away if anything goes wrong."""
+    connection.execute("PRAGMA journal_mode=OFF")
+    connection.execute("PRAGMA synchronous=OFF")
+
+
+def _convert(connection: Connection, file: SqliteFile) -> int:
+    """Adds what format 7 has; returns the number of revisions."""
+    connection.execute(text(f"ALTER TABLE {revisions.name} RENAME TO {_OLD_NAME}"))
+    metadata.create_all(connection)
+    for table in metadata.sorted_tables:
+        for index in table.indexes:
+            index.create(connection, checkfirst=True)
+    for row in _old_rows(connection):
+        row |= {"ranges": "{}", "totals": "{}", "chain": ""}
+        connection.execute(insert(revisions), sealed(revisions, row))
+    connection.execute(text(f"DROP TABLE {_OLD_NAME}"))
+    count = complete_history(connection)
+    write_format(connection)
+    file.mark(connection.exec_driver_sql)
+    return count
+
+
+def complete_history(connection: Connection) -> int:
+    """Works out what each revision keeps of its rows, and the runs; returns the number of those.
+
+    Only for rows that were not written by commits: a map of format 6, and synthetic ones.
+    """
+    ranges = _ranges(connection)
+    query = select(revisions).order_by(revisions.c.number, revisions.c.key)
+    rows = list(verified(revisions, connection.execute(query)))
+    committed = [row for row in rows if row["number"] is not None]
+    for row in rows:
+        row["ranges"] = to_json(_ranges_of(row, ranges))
+    _count(connection, committed, ranges)
+    for row in rows:
+        sealed(revisions, row)
+        connection.execute(revisions.update().where(revisions.c.key == row["key"]).values(row))
+    return len(committed)
+
+
+def _old_rows(connection: Connection) -> list[Row]:
+    old = _FORMAT_6.metadata.tables[revisions.name].to_metadata(MetaData(), name=_OLD_NAME)
+    return list(verified(old, connection.execute(select(old).order_by(old.c.key))))
+
+
+Ranges = Mapping[int, Mapping[str, tuple[int, int]]]
+
+
+def _ranges(connection: Connection) -> Ranges:
+    """First and last key of the rows of each revision by table, in one pass over each table."""
+    found: dict[int, dict[str, tuple[int, int]]] = {}
+    for table in VERSIONED:
+        key = table.primary_key.columns[0]
+        query = select(table.c.revision, func.min(key), func.max(key)).group_by(table.c.revision)
+        for revision, first, last in connection.execute(query.order_by(table.c.revision)):
+            found.setdefault(revision, {})[str(table.name)] = (first, last)
+    return found
+
+
+def _ranges_of(row: Row, ranges: Ranges) -> dict[str, tuple[int, int]]:
+    """The ranges of a revision; an open one may still get rows of every table."""
+    known = ranges.get(row["key"], {})
+    if row["status"] != "open":
+        return dict(known)
+    found = {}
+    for name in map(str, (one.name for one in VERSIONED)):
+        beyond = 1 + max((one[name][1] for one in ranges.values() if name in one), default=0)
+        found[name] = (known.get(name, (beyond, 0))[0], LARGEST_KEY)
+    return found
+
+
+def _count(connection: Connection, rows: list[Row], ranges: Ranges) -> None:
+    """Sets totals and content hashes of the committed revisions, in order; writes the runs."""
+    totals, held, chain = Totals(), Runs.none(), EMPTY_HASH
+    known = Identities(connection)
+    for row in rows:
+        own = Own(row["key"], ranges.get(row["key"], {}))
+        before, now = View(row["number"] - 1), View(row["number"])
+        counted = count_on(connection, before, totals, held, own) or count_all(connection, now)
+        totals, held = counted
+        chain = chained(connection, chain, row, own, known)
+        row |= {"totals": totals.to_json(), "chain": chain}
+    save_runs(connection, None, held)
+
+
+def _compare(source: sqlite3.Connection, made: sqlite3.Connection) -> int:
+    """Compares all that both formats have, row by row; returns the number of rows.
+
+    Raises:
+        MapCorruptError: something differs.
+    """
+    compared = 0
+    for table in _FORMAT_6.metadata.sorted_tables:
+        if table.name == map_format.name:
+            continue
+        kept = [
+            one.name
+            for one in table.columns
+            if table.name != revisions.name or one.name != "checksum"
+        ]
+        query = f"SELECT {', '.join(kept)} FROM {table.name} ORDER BY 1"
+        for old, new in zip(source.execute(query), made.execute(query), strict=True):
+            compared += 1
+            if old != new:
+                raise MapCorruptError(f"table {table.name}: row {old[0]} came out otherwise")
+    return compared
+
+
+def _sync(path: Path) -> None:
+    held = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(held)
+    finally:
+        os.close(held)
