@@ -7,7 +7,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from engram import plugins
@@ -134,12 +133,10 @@ def test_a_broken_reader_is_named_when_a_drive_is_recognised(added, tmp_path: Pa
 
 def test_a_broken_verb_says_so_and_leaves_the_others_alone(added) -> None:
     added("engram.verbs", "no_such_module:thing")
-    program = typer.Typer(cls=verbs.Program)
-    verbs.register(program)
-    helped = CliRunner().invoke(program, ["--help"])
+    helped = CliRunner().invoke(app, ["--help"])
     assert "one         Cannot be used: its package is broken." in helped.output
-    assert CliRunner().invoke(program, ["map", "--help"]).exit_code == 0
-    ran = CliRunner().invoke(program, ["one", "thing", "--fast"])
+    assert CliRunner().invoke(app, ["map", "--help"]).exit_code == 0
+    ran = CliRunner().invoke(app, ["one", "thing", "--fast"])
     assert isinstance(ran.exception, IncompatibleError)
     assert "verb 'one' of package-0" in str(ran.exception)
 

@@ -6,7 +6,7 @@ import functools
 import inspect
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, cast
 
 import typer
@@ -65,25 +65,75 @@ LABORATORY = ("demo", "lab")
 SPELLINGS = {"localize": "localise"}
 # Section of the verbs that installed packages add.
 _ADDED = "Lab"
-# Characters of a summary: a line of 80 holds it beside the name.
-_SUMMARY = 62
 _RESUMABLE = "interrupted; finished parts are kept, and the same command resumes"
+
+
+class Verbs(Mapping[str, Any]):
+    """Every verb and group of verbs by name; each is made when it is first looked up.
+
+    A command line needs one of them, and making all takes longer than most of what they do.
+    """
+
+    def __init__(self) -> None:
+        self._made: dict[str, Any] = {}
+        groups = {name for groups in NESTED.values() for name in groups}
+        added = [name for name in _PLUGINS.names() if name not in {*VERBS, *groups}]
+        self._sections = {
+            **{name: title for title, verbs in GROUPS.items() for name in verbs},
+            **dict.fromkeys(added, _ADDED),
+            **{name: title for title, groups in NESTED.items() for name in groups},
+        }
+
+    def section(self, name: str) -> str:
+        """Title of the help's section that lists a verb."""
+        return self._sections[name]
+
+    def summary(self, name: str) -> str:
+        """First line of a verb's help."""
+        verb = _verb(name)
+        text = verb.info.help if isinstance(verb, typer.Typer) else inspect.getdoc(verb)
+        return str(text or "").partition("\n")[0]
+
+    def __getitem__(self, name: str) -> Any:
+        """The verb as a command, or the group."""
+        if name not in self._sections:
+            raise KeyError(name)
+        if name not in self._made:
+            self._made[name] = _command(name)
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """The names, section by section."""
+        return iter(self._sections)
+
+    def __len__(self) -> int:
+        """Verbs and groups."""
+        return len(self._sections)
 
 
 class Program(TyperGroup):
     """Lists verbs by group, and accepts other spellings."""
 
+    def __init__(self, **given: Any) -> None:
+        super().__init__(**given)
+        self.commands: Any = Verbs()
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The names of all verbs."""
+        del ctx
+        return list(self.commands)
+
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """One section of the help for each group."""
         del ctx
-        width = max(len(name) for name in self.commands)
-        for title in dict.fromkeys(_group(verb) for verb in self.commands.values()):
+        width = max(map(len, self.commands))
+        for title in dict.fromkeys(map(self.commands.section, self.commands)):
             with formatter.section(title):
                 formatter.write_dl(
                     [
-                        (f"{name:{width}}", verb.get_short_help_str(_SUMMARY))
-                        for name, verb in self.commands.items()
-                        if _group(verb) == title
+                        (f"{name:{width}}", self.commands.summary(name))
+                        for name in self.commands
+                        if self.commands.section(name) == title
                     ]
                 )
 
@@ -105,40 +155,29 @@ class Program(TyperGroup):
         return super().resolve_command(ctx, args)
 
 
-def _group(verb: Any) -> str:
-    return str(getattr(verb, "rich_help_panel", None) or _ADDED)
-
-
-def register(app: typer.Typer) -> None:
-    """Gives the program its verbs, and those that other installed packages bring."""
-    for title, verbs in GROUPS.items():
-        for name, verb in verbs.items():
-            app.command(name, cls=Verb, rich_help_panel=title)(_tells_of_interruption(spread(verb)))
-    for title, groups in NESTED.items():
-        for name, group in groups.items():
-            _prepare(group)
-            app.add_typer(group, name=name, rich_help_panel=title)
-    own = {*VERBS, *(name for groups in NESTED.values() for name in groups)}
-    for name in _PLUGINS.names():
-        if name not in own:
-            _add(app, name)
-
-
-def _add(app: typer.Typer, name: str) -> None:
-    """Adds a verb of another package; one that cannot be used says so, and the others work."""
+def _verb(name: str) -> Callable[..., None] | typer.Typer:
+    """A verb's function, or a group of verbs; one that cannot be used says so when it runs."""
+    if name in VERBS:
+        return VERBS[name]
+    for groups in NESTED.values():
+        if name in groups:
+            return groups[name]
     try:
-        added = _PLUGINS.load(name)
+        return _PLUGINS.load(name)
     except IncompatibleError as error:
-        anything = {"ignore_unknown_options": True, "allow_extra_args": True}
-        register_as = app.command(name, cls=Verb, rich_help_panel=_ADDED, context_settings=anything)
-        register_as(_refusal(error))
-        return
-    if isinstance(added, typer.Typer):
-        _prepare(added)
-        app.add_typer(added, name=name, rich_help_panel=_ADDED)
-        return
-    verb = _tells_of_interruption(spread(added))
-    app.command(name, cls=Verb, rich_help_panel=_ADDED)(verb)
+        return _refusal(error)
+
+
+def _command(name: str) -> Any:
+    verb = _verb(name)
+    alone = typer.Typer(add_completion=False, rich_markup_mode=None)
+    if isinstance(verb, typer.Typer):
+        alone.add_typer(_prepared(verb), name=name)
+        return cast("TyperGroup", typer.main.get_command(alone)).commands[name]
+    broken = getattr(verb, "broken", False)
+    anything = {"ignore_unknown_options": broken, "allow_extra_args": broken}
+    alone.command(name, cls=Verb, context_settings=anything)(_tells_of_interruption(spread(verb)))
+    return typer.main.get_command(alone)
 
 
 def _refusal(error: IncompatibleError) -> Callable[[], None]:
@@ -146,6 +185,7 @@ def _refusal(error: IncompatibleError) -> Callable[[], None]:
         """Cannot be used: its package is broken."""
         raise error
 
+    refused.broken = True  # type: ignore[attr-defined]
     return refused
 
 
@@ -160,7 +200,8 @@ def _checked(name: str, found: Any) -> Callable[..., None] | typer.Typer:
 _PLUGINS = PluginGroup("engram.verbs", "verb", _checked)
 
 
-def _prepare(group: typer.Typer) -> None:
+@functools.cache
+def _prepared(group: typer.Typer) -> typer.Typer:
     """The same for every verb of a group, and of the groups in it."""
     for command in group.registered_commands:
         assert command.callback is not None
@@ -168,7 +209,8 @@ def _prepare(group: typer.Typer) -> None:
         command.cls = command.cls if issubclass(command.cls or TyperCommand, Verb) else Verb
     for inner in group.registered_groups:
         assert inner.typer_instance is not None
-        _prepare(inner.typer_instance)
+        _prepared(inner.typer_instance)
+    return group
 
 
 def _tells_of_interruption(
@@ -215,8 +257,6 @@ def _program(
 ) -> None:
     del version  # printed by its callback
 
-
-register(app)
 
 # What Typer raises for any mistyped command line; of its kinds it exports only this one's child.
 _UsageError = cast("type[typer.BadParameter]", typer.BadParameter.__mro__[1])
