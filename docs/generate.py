@@ -1,4 +1,4 @@
-"""References that the code knows: every verb's help, every setting, the public Python names."""
+"""References that the code knows: every verb's help, the public settings and Python names."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 import engram
 from engram.cli.app import GROUPS, NESTED, app
-from engram.cli.settings import AllSettings, every_setting
+from engram.cli.settings import AllSettings, shown_settings
 from engram.doctor.examination import DoctorConfig
 from engram.doctor.table import CHECKS
 from engram.maps.schema import metadata
@@ -54,11 +54,11 @@ def _help(name: str, verb: Any, context: Any) -> list[str]:
 
 
 def settings() -> str:
-    """A table of all settings with their defaults."""
+    """A table of the public settings with their defaults."""
     rows = ["| setting | default | bounds | meaning |", "| --- | --- | --- | --- |"]
     rows += [
         f"| `{one.key}` | `{one.value}` | {one.bounds} | {one.description} |"
-        for one in every_setting(AllSettings())
+        for one in shown_settings(AllSettings(), every=False)
     ]
     return "\n".join(rows).replace("<", "&lt;") + "\n"
 

@@ -1,7 +1,7 @@
 """Settings: TOML text → frozen dataclasses and back. Unknown keys are errors at any depth.
 
 A field declares its bounds, meaning, unit and source:
-``Annotated[float, Meta(ge=0, description="search radius, m. Source: [L15] §III")] = 8.0``.
+``Annotated[float, Meta(ge=0, description="search radius, m. Source: [L15] §III"), PUBLIC] = 8.0``.
 """
 
 from __future__ import annotations
@@ -26,6 +26,16 @@ import numpy as np
 from engram.errors import ConfigError
 
 T = TypeVar("T")
+
+
+class Public:
+    """Marks a field as a public setting: documented, and stable between versions.
+
+    All others are for experts: they are in the resolved configuration, without promise.
+    """
+
+
+PUBLIC = Public()
 
 # Engram's own longest, all settings with what they mean, has 35,000 characters.
 _MOST_CHARACTERS = 400_000

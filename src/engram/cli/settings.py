@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from engram.config import check_bounds, from_dict, read_toml, to_dict
+from engram.config import PUBLIC, check_bounds, from_dict, read_toml, to_dict
 from engram.errors import ConfigError
 from engram.fleet.settings import BuildSettings, DownloadSettings, MergeSettings
 from engram.frontend.frame import DescriptorKind
@@ -28,10 +28,14 @@ class DriveSettings:
     """How `map` and `localise` attempt; options of the command count before them."""
 
     ranking: Annotated[
-        str, Meta(description="which nodes to try first: recall, path, path-near, distance")
+        str, Meta(description="which nodes to try first: recall, path, path-near, distance"), PUBLIC
     ] = "recall"
-    lanes: Annotated[int, Meta(ge=1, description="attempts in parallel, Np. [L15] Fig. 3")] = 2
-    rounds: Annotated[int, Meta(ge=1, description="rounds of attempts, Nr. [L15] Fig. 3")] = 2
+    lanes: Annotated[
+        int, Meta(ge=1, description="attempts in parallel, Np. [L15] Fig. 3"), PUBLIC
+    ] = 2
+    rounds: Annotated[
+        int, Meta(ge=1, description="rounds of attempts, Nr. [L15] Fig. 3"), PUBLIC
+    ] = 2
     threads: (
         Annotated[
             int,
@@ -40,6 +44,7 @@ class DriveSettings:
                 description="most threads of a robot, its loop included; none: one for "
                 "each lane, and 2 to 4 that decode, read ahead, write and close loops",
             ),
+            PUBLIC,
         ]
         | None
     ) = None
@@ -131,12 +136,16 @@ class Setting:
         value: as resolved.
         description: unit, meaning and source.
         bounds: such as ">= 0"; empty where none are declared.
+        public: whether it is documented and stable; others are for experts.
+        changed: whether it differs from its default.
     """
 
     key: str
     value: Any
     description: str
     bounds: str
+    public: bool
+    changed: bool
 
     @property
     def comment(self) -> str:
@@ -145,19 +154,32 @@ class Setting:
         return "  ".join(text for text in (self.bounds, first) if text)
 
 
-def every_setting(settings: Any, tables: str = "") -> Iterator[Setting]:
-    """All settings of a dataclass at any depth, in the order of their declaration."""
+def every_setting(settings: AllSettings) -> Iterator[Setting]:
+    """All settings, in the order of their declaration."""
+    return _settings_in(settings, AllSettings(), "")
+
+
+def _settings_in(settings: Any, defaults: Any, tables: str) -> Iterator[Setting]:
+    """Those of a dataclass at any depth."""
     hints = typing.get_type_hints(type(settings), include_extras=True)
     documented = _documented(type(settings))
     for one in dataclasses.fields(settings):
         value, key = getattr(settings, one.name), f"{tables}{one.name}"
         if dataclasses.is_dataclass(value):
-            yield from every_setting(value, f"{key}.")
+            yield from _settings_in(value, getattr(defaults, one.name), f"{key}.")
             continue
-        metas = [meta for meta in _annotations(hints[one.name]) if isinstance(meta, Meta)]
+        marks = _annotations(hints[one.name])
+        metas = [mark for mark in marks if isinstance(mark, Meta)]
         words = "; ".join(m.description for m in metas if m.description)
         words = words or documented.get(one.name, "")
-        yield Setting(key, to_dict({"": value})[""], words, ", ".join(map(_bounds, metas)))
+        yield Setting(
+            key,
+            to_dict({"": value})[""],
+            words,
+            bounds=", ".join(map(_bounds, metas)),
+            public=PUBLIC in marks,
+            changed=value != getattr(defaults, one.name),
+        )
 
 
 def _documented(kind: type) -> dict[str, str]:
@@ -182,11 +204,16 @@ def _bounds(meta: Meta) -> str:
     return ", ".join(f"{sign} {limit:g}" for sign, limit in given if limit is not None)
 
 
-def settings_toml(settings: Any) -> str:
+def shown_settings(settings: AllSettings, *, every: bool) -> list[Setting]:
+    """The public settings and those that were changed, or every one."""
+    return [one for one in every_setting(settings) if every or one.public or one.changed]
+
+
+def settings_toml(settings: AllSettings, *, every: bool = True) -> str:
     """The settings as a file that `--config` reads; a setting that is not given is a comment."""
     lines: list[str] = []
     table = None
-    for one in every_setting(settings):
+    for one in shown_settings(settings, every=every):
         above, _, name = one.key.rpartition(".")
         if above != table:
             lines += ["", f"[{above}]"]

@@ -23,21 +23,26 @@ def settings(
     ] = SettingsAction.SHOW,
     *,
     given: options.SettingsGiven,
+    every: Annotated[
+        bool, typer.Option("--all", help="Experts' settings, too, which may change.")
+    ] = False,
     toml: Annotated[bool, typer.Option("--toml", help="Print a file that --config reads.")] = False,
     as_json: options.Json = False,
 ) -> None:
-    """Show every setting: value, bounds, meaning.
+    """Show the settings: value, bounds, meaning.
 
     Verbs with --config or --set take these settings. The resolved settings are stored with each
-    revision of a map.
+    revision of a map. Without --all, the public ones and those that you change are shown; --json
+    has all.
 
     \b
     Examples:
       engram settings show
+      engram settings show --all
       engram settings show --toml > engram.toml
       engram settings show --set mapper.save_every_m=2 --json
     """
-    from engram.cli.settings import every_setting, settings_toml
+    from engram.cli.settings import settings_toml, shown_settings
     from engram.config import plain
 
     del action  # there is one
@@ -46,9 +51,9 @@ def settings(
         print(json.dumps(plain(resolved)))
         return
     if toml:
-        typer.echo(settings_toml(resolved))
+        typer.echo(settings_toml(resolved, every=every))
         return
-    for one in every_setting(resolved):
+    for one in shown_settings(resolved, every=every):
         words = one.comment
         typer.echo(f"{one.key} = {json.dumps(one.value)}" + (f"  # {words}" if words else ""))
 

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from engram.config import check_bounds
+from engram.config import PUBLIC, check_bounds
 from engram.frontend.features import SideMatches, match_sides
 from engram.frontend.frame import Frame, FrameStatus, StereoPair
 from engram.frontend.matching import MatcherConfig, match_frames
@@ -256,22 +256,22 @@ class DoctorConfig:
             calibration of whole ones have 1.
     """
 
-    frames: Annotated[int, Meta(ge=0)] = 200
+    frames: Annotated[int, Meta(ge=0), PUBLIC] = 200
     every: Annotated[int, Meta(ge=1)] = 3
     least_frames: Annotated[int, Meta(ge=2)] = 10
     negative_share: Annotated[float, Meta(gt=0, lt=1)] = 0.5
     upright: float = -0.25
     forward_m: Annotated[float, Meta(gt=0)] = 0.15
     row_jump_px: Annotated[float, Meta(gt=0)] = 0.25
-    row_offset_px: Annotated[float, Meta(gt=0)] = 1.3
+    row_offset_px: Annotated[float, Meta(gt=0), PUBLIC] = 1.3
     slight_row_offset_px: Annotated[float, Meta(gt=0)] = 0.8
-    no_odometry: Annotated[float, Meta(gt=0, lt=1)] = 0.5
+    no_odometry: Annotated[float, Meta(gt=0, lt=1), PUBLIC] = 0.5
     frozen_frames: Annotated[int, Meta(ge=1)] = 2
     equal_share: Annotated[float, Meta(gt=0, le=1)] = 0.9
     fixed_share: Annotated[float, Meta(ge=0, lt=1)] = 0.01
     doubted: Annotated[float, Meta(ge=0, lt=1)] = 0.1
     gap_ratio: Annotated[float, Meta(gt=1)] = 2.5
-    faulty_share: Annotated[float, Meta(gt=0, le=1)] = 0.05
+    faulty_share: Annotated[float, Meta(gt=0, le=1), PUBLIC] = 0.05
     jump_s: Annotated[float, Meta(gt=0)] = 60.0
     least_rate_hz: Annotated[float, Meta(gt=0)] = 4.0
     exposure_step: Annotated[float, Meta(gt=0)] = 0.8

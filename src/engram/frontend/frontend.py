@@ -11,7 +11,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.config import check_bounds, config_hash, to_dict
+from engram.config import PUBLIC, check_bounds, config_hash, to_dict
 from engram.errors import ConfigError, IncompatibleError, SequenceError
 from engram.frontend.blobs import quantised_landmarks
 from engram.frontend.features import Keypoints, feature_kind
@@ -102,23 +102,23 @@ class FrontendConfig:
         thumbnails: whether frames carry a small picture for people.
     """
 
-    descriptor: DescriptorKind = BRIEF
-    landmarks: Annotated[int, Meta(ge=1, le=100_000)] = 600
+    descriptor: Annotated[DescriptorKind, PUBLIC] = BRIEF
+    landmarks: Annotated[int, Meta(ge=1, le=100_000), PUBLIC] = 600
     octaves: Annotated[int, Meta(ge=1, le=4)] = 2
-    fast_threshold: Annotated[int, Meta(ge=1, le=254)] = 7
-    second_threshold: Annotated[int, Meta(ge=0, le=254)] = 3
-    side_difference: Annotated[float, Meta(ge=0, le=100)] = 0.25
+    fast_threshold: Annotated[int, Meta(ge=1, le=254), PUBLIC] = 7
+    second_threshold: Annotated[int, Meta(ge=0, le=254), PUBLIC] = 3
+    side_difference: Annotated[float, Meta(ge=0, le=100), PUBLIC] = 0.25
     cell_px: Annotated[int, Meta(ge=4, le=4096)] = 32
-    max_disparity_px: Annotated[int, Meta(ge=1, le=500)] = 124
+    max_disparity_px: Annotated[int, Meta(ge=1, le=500), PUBLIC] = 124
     min_disparity_px: Annotated[float, Meta(ge=1 / 64, le=500)] = 0.5
     uniqueness: Annotated[float, Meta(ge=0.01, le=1)] = 0.85
     max_residual: Annotated[float, Meta(ge=0, le=2)] = 0.7
     max_sigma_px: Annotated[float, Meta(ge=1 / 64, le=4)] = 1.0
     sigma_floor_px: Annotated[float, Meta(ge=0, le=4)] = 0.05
     sigma_scale: Annotated[float, Meta(ge=0, le=100)] = 1.0
-    min_landmarks: Annotated[int, Meta(ge=0, le=100_000)] = 40
+    min_landmarks: Annotated[int, Meta(ge=0, le=100_000), PUBLIC] = 40
     dark_mean: Annotated[float, Meta(ge=0, le=255)] = 16.0
-    thumbnails: bool = True
+    thumbnails: Annotated[bool, PUBLIC] = True
 
     def landmarks_for(self, pixels: int) -> int:
         """Landmarks wanted of an image of so many pixels; `landmarks` is for 512 × 384."""

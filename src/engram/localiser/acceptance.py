@@ -12,10 +12,12 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.config import PUBLIC
 from engram.errors import ConfigError
 from engram.frontend.frame import Frame
 from engram.frontend.matching import Match
@@ -143,8 +145,8 @@ class AcceptanceConfig:
             deviations. At larger values most additional matches are wrong.
     """
 
-    rule: Rule = Rule.CONFIDENCE
-    min_confidence: float = 4.25
+    rule: Annotated[Rule, PUBLIC] = Rule.CONFIDENCE
+    min_confidence: Annotated[float, PUBLIC] = 4.25
     min_confidence_told: float = 4.74
     min_confidence_lost: float = 5.39
     lost_long_m: float = 100.0
@@ -152,10 +154,10 @@ class AcceptanceConfig:
     settle_after_m: float = 10.0
     join_share: float = 1 / 3
     join_after_m: float = 60.0
-    doubt_after: float = 3.0
+    doubt_after: Annotated[float, PUBLIC] = 3.0
     rival_share: float = 0.6
-    min_inliers: int = 20
-    min_inliers_lost: int = 60
+    min_inliers: Annotated[int, PUBLIC] = 20
+    min_inliers_lost: Annotated[int, PUBLIC] = 60
     min_inliers_plausible: int = 35
     min_spread_lost: float = 0.25
     min_height_lost: float = 0.4

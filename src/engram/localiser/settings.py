@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from engram.config import check_bounds
+from engram.config import PUBLIC, check_bounds
 from engram.errors import ConfigError
 from engram.frontend.matching import MatcherConfig
 from engram.graph.basin import BasinConfig
@@ -126,15 +126,15 @@ class LocaliserConfig:
         lookalikes: how runs of look-alikes are detected.
     """
 
-    search_radius_m: float = 8.0
-    max_search_radius_m: float = 30.0
-    view_gate_rad: float = float(np.deg2rad(60.0))
-    own_exclusion_m: float = 30.0
-    lost_after_m: float = 10.0
+    search_radius_m: Annotated[float, PUBLIC] = 8.0
+    max_search_radius_m: Annotated[float, PUBLIC] = 30.0
+    view_gate_rad: Annotated[float, PUBLIC] = float(np.deg2rad(60.0))
+    own_exclusion_m: Annotated[float, PUBLIC] = 30.0
+    lost_after_m: Annotated[float, PUBLIC] = 10.0
     greatest_gap_m: float = 3.0
     followed_gap_m: float = 1.0
-    guide_below_m: float = 0.6
-    guide_below_rad: float = float(np.deg2rad(4.0))
+    guide_below_m: Annotated[float, PUBLIC] = 0.6
+    guide_below_rad: Annotated[float, PUBLIC] = float(np.deg2rad(4.0))
     narrow_m: float = 0.1
     narrow_rad: float = 0.01
     earlier_doubt: Annotated[
@@ -154,6 +154,7 @@ class LocaliserConfig:
             description="surest predicts a node by its least uncertain chain, proximity edges "
             "among them; breadth-first by its shortest, within the radius, as [G16] §III-A does"
         ),
+        PUBLIC,
     ] = NeighbourhoodSearch.SUREST
     path_entries: Annotated[
         PathEntries,
@@ -161,6 +162,7 @@ class LocaliserConfig:
             description="nodes on a path: all counts those that the drive saved, too; matches only "
             "those that it matched, as [L15] §IV does"
         ),
+        PUBLIC,
     ] = PathEntries.ALL
     success: Annotated[
         Success,
@@ -168,6 +170,7 @@ class LocaliserConfig:
             description="of several successes of a round, most-inliers keeps the best; first ends "
             "the frame with the highest ranked, as [L15] §III-C does"
         ),
+        PUBLIC,
     ] = Success.MOST_INLIERS
     lens_depth_m: Annotated[
         float,
@@ -185,6 +188,7 @@ class LocaliserConfig:
             description="nodes within so many standard deviations of a satellite fix are proposed "
             "to a lost robot in an anchored map; a match decides; 0: fixes propose nothing",
         ),
+        PUBLIC,
     ] = 3.0
     recent: RecentConfig = field(default_factory=RecentConfig)
     hypotheses: HypothesesConfig = field(default_factory=HypothesesConfig)

@@ -19,7 +19,7 @@ from typing import Annotated, Protocol, TypeAlias
 import numpy as np
 from msgspec import Meta
 
-from engram.config import check_bounds
+from engram.config import PUBLIC, check_bounds
 from engram.errors import ConfigError, MapError
 from engram.frontend.frame import Frame, FrameStatus
 from engram.graph.graph import ChainTree, ExperienceGraph
@@ -457,12 +457,12 @@ class MapperConfig:
         proximity: which experiences are joined by dead reckoning; merging joins them alike.
     """
 
-    save_every_m: float = 1.0
-    save_every_rad: float = float(np.deg2rad(15.0))
-    sure_inliers: int = 60
+    save_every_m: Annotated[float, PUBLIC] = 1.0
+    save_every_rad: Annotated[float, PUBLIC] = float(np.deg2rad(15.0))
+    sure_inliers: Annotated[int, PUBLIC] = 60
     tie_within_m: float = 8.0
-    checkpoint_every: int = 20
-    memory_bytes: int = 256_000_000
+    checkpoint_every: Annotated[int, PUBLIC] = 20
+    memory_bytes: Annotated[int, PUBLIC] = 256_000_000
     votes: VoteConfig = field(default_factory=VoteConfig)
     proximity: ProximityConfig = field(default_factory=ProximityConfig)
 

@@ -10,7 +10,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.config import check_bounds
+from engram.config import PUBLIC, check_bounds
 from engram.errors import ConfigError, IncompatibleError
 from engram.frontend.frame import Frame, FrameStatus
 from engram.frontend.matching import MatcherConfig, check_same_kind, core_settings, features
@@ -80,7 +80,7 @@ class OdometryConfig:
 
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
-    min_inliers: Annotated[int, Meta(ge=6)] = 15
+    min_inliers: Annotated[int, Meta(ge=6), PUBLIC] = 15
     unexpected_inliers: Annotated[int, Meta(ge=6)] = 60
     usual_share: Annotated[float, Meta(ge=0, le=1)] = 0.4
     plausible_inliers: Annotated[int, Meta(ge=6)] = 35
@@ -96,7 +96,7 @@ class OdometryConfig:
     acceleration_m_s2: float = 4.0
     angular_acceleration_rad_s2: float = 5.0
     max_prediction_s: float = 0.25
-    keyframe_flow_px: float = 10.0
+    keyframe_flow_px: Annotated[float, PUBLIC] = 10.0
     keyframe_share: float = 0.3
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from engram.config import check_bounds
+from engram.config import PUBLIC, check_bounds
 
 
 class IterationUnit(StrEnum):
@@ -37,6 +37,7 @@ class RecentConfig:
             ge=0,
             description="iterations remembered; 5 to 200 are nearly alike. Source: [L15] Fig. 13",
         ),
+        PUBLIC,
     ] = 10
     T_unit: Annotated[
         IterationUnit,
@@ -45,9 +46,10 @@ class RecentConfig:
             "first, so that the memory does not depend on the frame rate; frame makes one of each, "
             "as the paper does. Source: method §3.6"
         ),
+        PUBLIC,
     ] = IterationUnit.DISTANCE
     iteration_m: Annotated[
-        float, Meta(gt=0, description="length of an iteration, m. Source: method §3.6")
+        float, Meta(gt=0, description="length of an iteration, m. Source: method §3.6"), PUBLIC
     ] = 0.5
 
     def __post_init__(self) -> None:

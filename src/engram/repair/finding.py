@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from engram.config import check_bounds
+from engram.config import PUBLIC, check_bounds
 from engram.errors import MapCorruptError
 from engram.frontend.features import feature_kind
 from engram.frontend.matching import Match, match_frames, pair_seed
@@ -119,8 +119,11 @@ class RepairConfig:
             description="disagreement with the rest of the map from which an edge is suspected, m; "
             "smaller errors do not lead a robot to another place",
         ),
+        PUBLIC,
     ] = 2.0
-    gross_rad: Annotated[float, Meta(ge=0, description="the same of its direction, rad")] = 0.25
+    gross_rad: Annotated[
+        float, Meta(ge=0, description="the same of its direction, rad"), PUBLIC
+    ] = 0.25
     gross_chi2: Annotated[
         float, Meta(gt=0, description="the same in squared standard deviations")
     ] = 50.0

@@ -20,7 +20,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram.calibration.calibrated_pair import MAX_CHARACTERS, read_yaml
-from engram.config import check_bounds
+from engram.config import PUBLIC, check_bounds
 from engram.counts import counted
 from engram.errors import ConfigError, InputError, MapCorruptError
 from engram.frontend.frame import Frame
@@ -686,8 +686,8 @@ class IslandsConfig:
         certain_m: largest standard deviation of the distances between them.
     """
 
-    sigmas: Annotated[float, Meta(gt=0, le=10)] = 3.0
-    reach_m: Annotated[float, Meta(ge=0, le=50)] = 4.0
+    sigmas: Annotated[float, Meta(gt=0, le=10), PUBLIC] = 3.0
+    reach_m: Annotated[float, Meta(ge=0, le=50), PUBLIC] = 4.0
     turn_rad: Annotated[float, Meta(gt=0, le=np.pi)] = 0.8
     nearest: Annotated[int, Meta(ge=1, le=100)] = 5
     attempts: Annotated[int, Meta(ge=1, le=100_000)] = 400

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from engram.config import check_bounds
+from engram.config import PUBLIC, check_bounds
 from engram.errors import ConfigError
 from engram.localiser.localisation import Budget
 from engram.localiser.relocalisation import RELOCALISERS
@@ -55,28 +55,35 @@ class MergeSettings:
             input gives the same map.
     """
 
-    ranking: Annotated[str, Meta(description="key of POLICIES")] = "recall"
-    lanes: Annotated[int, Meta(ge=1, description="attempts in parallel, Np")] = 2
-    rounds: Annotated[int, Meta(ge=1, description="rounds of attempts for a frame, Nr")] = 4
+    ranking: Annotated[str, Meta(description="key of POLICIES"), PUBLIC] = "recall"
+    lanes: Annotated[int, Meta(ge=1, description="attempts in parallel, Np"), PUBLIC] = 2
+    rounds: Annotated[int, Meta(ge=1, description="rounds of attempts for a frame, Nr"), PUBLIC] = 4
     relocaliser: Annotated[
-        str, Meta(description="places segments without a known neighbour: key of RELOCALISERS")
+        str,
+        Meta(description="places segments without a known neighbour: key of RELOCALISERS"),
+        PUBLIC,
     ] = "fabmap"
     sure_inliers: Annotated[
         int,
         Meta(ge=0, description="inliers needed to drop a node; 0: any match. Source: [G16] §V-A"),
+        PUBLIC,
     ] = 60
     unit: Annotated[
         Unit,
         Meta(
             description="what is omitted or taken at once: frame or segment. Source: [G16] Fig. 4"
         ),
+        PUBLIC,
     ] = Unit.FRAME
     segment_share: Annotated[
-        float, Meta(ge=0, le=1, description="share of a segment that must localise to omit it")
+        float,
+        Meta(ge=0, le=1, description="share of a segment that must localise to omit it"),
+        PUBLIC,
     ] = 0.5
     seed: Annotated[
         SeedFrom,
         Meta(description="start of a segment's replay: neighbour or places. Source: [G16] §V-A"),
+        PUBLIC,
     ] = SeedFrom.NEIGHBOUR
 
     @property
