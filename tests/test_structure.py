@@ -21,7 +21,6 @@ _LONG = {
 _MANY_PARAMETERS = {
     "fleet/merge/merging.py": {"merge"},
     "maps/map.py": {"robot"},
-    "sequences/opening.py": {"open_drive"},
     "testing/contracts.py": {"make_context"},
 }
 _ONLY_BASES = {"MapReader", "MapWriter"}

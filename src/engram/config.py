@@ -21,7 +21,6 @@ from collections.abc import Collection
 from typing import Any, TypeVar
 
 import msgspec
-import numpy as np
 
 from engram.errors import ConfigError
 
@@ -136,6 +135,8 @@ def plain(value: Any) -> Any:
 
 
 def _of_other_kinds(value: Any) -> Any:
+    import numpy as np
+
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, os.PathLike):

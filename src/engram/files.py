@@ -39,7 +39,7 @@ def map_path(location: Path | str) -> Path:
         # Not shown, as it may hold a password.
         raise InputError(
             "this is the address of a PostgreSQL database, not a map file; the database of a "
-            "centre is given with --database of engram centre"
+            "centre is given in the environment: ENGRAM_DATABASE"
         )
     try:
         str(location).encode()

@@ -6,7 +6,8 @@ import difflib
 import inspect
 from collections.abc import Callable
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from pathlib import Path
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from engram.errors import ConfigError
 
@@ -44,3 +45,22 @@ def keywords(**meant: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
         return call
 
     return checked
+
+
+def keywords_of(
+    options: Callable[_P, Any], **meant: str
+) -> Callable[[Callable[..., _T]], Callable[Concatenate[str | Path, _P], _T]]:
+    """Gives a function of a path the keywords of a dataclass, for people and for type checkers.
+
+    Args:
+        options: the dataclass.
+        **meant: as in `keywords`.
+    """
+
+    def declared(function: Callable[..., _T]) -> Callable[Concatenate[str | Path, _P], _T]:
+        own = list(inspect.signature(function).parameters.values())[:1]
+        taken = inspect.signature(options).parameters.values()
+        function.__signature__ = inspect.Signature([*own, *taken])  # type: ignore[attr-defined]
+        return keywords(**meant)(function)
+
+    return declared

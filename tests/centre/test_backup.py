@@ -81,7 +81,10 @@ def test_robots_hand_in_again_what_an_older_file_that_was_put_back_lacks(
 
 
 def test_tables_that_name_no_map_are_those_of_another_centre(tmp_path):
-    with Centre(tmp_path / "centre") as centre, pytest.raises(InputError, match="give --database"):
+    with (
+        Centre(tmp_path / "centre") as centre,
+        pytest.raises(InputError, match="set ENGRAM_DATABASE"),
+    ):
         back_up(centre, tmp_path / "backup")
     assert not (tmp_path / "backup").exists()
 

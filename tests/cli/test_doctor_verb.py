@@ -54,7 +54,7 @@ def test_pairs_that_map_refuses_are_a_finding(engram, street: Path, tmp_path: Pa
     (bad,) = (one for one in ran.json["findings"] if one["code"] == "bad_pairs")
     assert bad["value"] == 2
     assert "image 3 is missing in " in bad["message"]
-    assert "--skip-bad" in bad["cure"]
+    assert "drive.skip_bad" in bad["cure"]
     for path in left:
         path.write_bytes(b"cut short")
     assert "bad_pairs" in engram("doctor", folder).out

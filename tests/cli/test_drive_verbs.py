@@ -168,7 +168,7 @@ def test_nothing_stays_of_a_new_map_where_a_drive_cannot_be_read(
     assert ran.status == 2
     assert first.name in ran.err
     assert list(town.parent.iterdir()) == []
-    assert engram("map", town, broken, "--skip-bad").status == 0
+    assert engram("map", town, broken, "--set", "drive.skip_bad=true").status == 0
 
 
 def test_no_map_is_made_to_see_one_of_its_revisions(tmp_path: Path) -> None:
@@ -190,16 +190,16 @@ def test_the_command_of_a_drive_keeps_what_was_given(engram, street: Path, tmp_p
     drive = tmp_path / "my drive"
     shutil.copytree(street, drive)
     (drive / "calibration.toml").rename(tmp_path / "half $.toml")
-    given = ("--calibration", tmp_path / "half $.toml", "--frames", "2:6", "--skip-bad")
+    given = ("--calibration", tmp_path / "half $.toml", "--set", "drive.skip_bad=true")
     told = engram("drive", "info", drive, *given)
     assert told.status == 0, told.err
     ran = carried_out(engram, told.out, tmp_path)
     assert ran.status == 0, ran.err
-    assert "4 frames: " in ran.out
+    assert "12 frames: " in ran.out
 
 
 def test_the_command_of_a_bag_keeps_what_was_given(engram, street_bag, tmp_path: Path) -> None:
-    told = engram("drive", "info", street_bag, "--frames", "2:6", "--robot", "r 2")
+    told = engram("drive", "info", street_bag, "--set", "drive.robot=r 2")
     assert carried_out(engram, told.out, tmp_path).status == 0
     assert (
         engram("info", tmp_path / "m.engram", "--sessions", "--json").json["session_list"][0][

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import dataclasses
 import re
 import tomllib
 from collections.abc import Iterator
@@ -17,7 +16,7 @@ import typer
 
 from engram.cli import wording
 from engram.cli.app import LABORATORY, SPELLINGS, VERBS, app
-from engram.cli.options import Drive
+from engram.cli.options import Drive, SettingsGiven
 from engram.cli.settings import AllSettings, every_setting
 from engram.errors import InputError
 
@@ -53,8 +52,6 @@ _SPOKEN_BY: dict[str, tuple[tuple[str, ...], ...]] = {
     "robot/anchors.py": (("anchor",),),
     "robot/inspecting.py": (("export",),),
 }
-# The doctor leaves bad pairs out by itself, and maps nothing.
-_SPARED = {("doctor", "--skip-bad")}
 
 
 def texts() -> Iterator[tuple[str, int, str]]:
@@ -165,7 +162,7 @@ def test_every_option_is_one_of_the_verbs_that_speak() -> None:
         ours = _PIP.sub("", _VERB.split(text)[0])
         for option in _OPTION.findall(ours):
             for words in verbs:
-                known = option in options_of(command(words)) or (words[0], option) in _SPARED
+                known = option in options_of(command(words))
                 wrong += [] if known else [f"{place}:{line}: {' '.join(words)} {option}"]
             if option not in every_option():
                 wrong.append(f"{place}:{line}: {option}")
@@ -249,13 +246,11 @@ def test_the_next_step_asks_for_nothing_that_is_not_installed(monkeypatch, drawn
 
 
 def test_options_of_a_drive_are_typed_as_they_were_given() -> None:
-    given = Drive(
-        **{
-            one.name: True if one.default is False else ["a b"] if one.name == "motion" else "a b"
-            for one in dataclasses.fields(Drive)
-        }
-    )
+    given = Drive(**{name: ["a b"] if name == "motion" else "a b" for name in Drive.taken})
     words = given.typed()
     assert {one for one in words if one.startswith("--")} <= options_of(command(("map",)))
-    assert len(words) == 2 * len(dataclasses.fields(Drive)) - 1  # --skip-bad has no value
+    assert len(words) == 2 * len(Drive.taken)
     assert Drive().typed() == []
+    assert SettingsGiven(Path("a b"), ["c=1", "d=2"]).typed() == [
+        "--config", "a b", "--set", "c=1", "--set", "d=2",
+    ]  # fmt: skip

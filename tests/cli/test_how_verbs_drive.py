@@ -66,9 +66,13 @@ def test_the_settings_rank_and_attempt_unless_options_do(
     assert seen[-1].threads is None
     engram(*words, "--set", "drive.threads=7")
     assert seen[-1].threads == 7
-    if verb in {"map", "localise", "live", "lab try"}:
-        engram(*words, "--config", "linegar2015", "--ranking", "distance", "--lanes", 1)
-        assert (seen[-1].ranking, seen[-1].lanes, seen[-1].rounds) == ("distance", 1, 1)
+    engram(*words, "--config", "linegar2015", "--set", "drive.lanes=1")
+    assert (seen[-1].ranking, seen[-1].lanes, seen[-1].rounds) == ("path", 1, 1)
+    engram(*words, "--set", "drive.relocaliser=none")
+    assert seen[-1].relocaliser is None
+    if verb in {"localise", "live", "lab try"}:
+        engram(*words, "--config", "linegar2015", "--ranking", "distance")
+        assert (seen[-1].ranking, seen[-1].lanes, seen[-1].rounds) == ("distance", 2, 1)
 
 
 class _Nothing:

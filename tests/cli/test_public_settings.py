@@ -9,18 +9,18 @@ from engram.cli.settings import AllSettings, every_setting, read_settings
 PUBLIC = """
 frontend: descriptor landmarks fast_threshold second_threshold side_difference
   max_disparity_px min_landmarks thumbnails
-odometry: min_inliers keyframe_flow_px
-localiser: search_radius_m max_search_radius_m view_gate_rad own_exclusion_m lost_after_m
-  guide_below_m guide_below_rad neighbourhood path_entries success fix_sigmas
+odometry: min_inliers
+localiser: search_radius_m max_search_radius_m view_gate_rad lost_after_m guide_below_m
+  guide_below_rad neighbourhood path_entries success fix_sigmas
 localiser.recent: T T_unit iteration_m
 localiser.acceptance: rule min_confidence doubt_after min_inliers min_inliers_lost
-mapper: save_every_m save_every_rad sure_inliers checkpoint_every memory_bytes
-doctor: frames row_offset_px no_odometry faulty_share
-placing: level_rad
-drive: ranking lanes rounds threads
+mapper: save_every_m save_every_rad sure_inliers checkpoint_every
+doctor: frames row_offset_px faulty_share
+drive: format rig channel from_ to skip_bad longitude_deg zone calibration field_of_view_deg
+  mask left right motion ranking lanes rounds threads relocaliser
 merge: ranking lanes rounds relocaliser sure_inliers unit segment_share seed
 build: max_gap_m estimator
-download: window_min epoch_min best_percent buffer_min widen_min latitude_deg radius_m
+download: window_min epoch_min best_percent buffer_min latitude_deg radius_m thumbnails
 repair: gross_m gross_rad
 islands: sigmas reach_m
 """
@@ -43,6 +43,8 @@ def test_every_setting_can_be_set_public_or_not() -> None:
 
 
 def _toml(value: object) -> str:
+    if isinstance(value, tuple | list):
+        return str(list(value))
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 

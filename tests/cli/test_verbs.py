@@ -75,7 +75,8 @@ def test_localise_gives_the_documented_json(engram, street: Path, town: Path) ->
 
 
 def test_budget_bounds_the_attempts(engram, street: Path, town: Path) -> None:
-    arguments = ("--lanes", 1, "--rounds", 1, "--ranking", "random", "--json")
+    budget = ("--set", "drive.lanes=1", "--set", "drive.rounds=1")
+    arguments = (*budget, "--ranking", "random", "--json")
     result = engram("localise", town, street, *arguments).json
     assert all(frame["attempts"] <= 1 for frame in result["frames"])
 
@@ -199,7 +200,7 @@ def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Pa
         (("localise", "absent.engram", "STREET"), "absent.engram"),
         (("localise", "TOWN", "nowhere"), "nowhere"),
         (("localise", "TOWN", "STREET", "--ranking", "best"), "known: "),
-        (("localise", "TOWN", "STREET", "--relocaliser", "gps"), "known: "),
+        (("localise", "TOWN", "STREET", "--set", "drive.relocaliser=gps"), "known: "),
         (("localise", "TOWN", "STREET", "--at", 7), "not 7"),
         (("localise", "TOWN", "STREET", "--frames", "1:x"), "1:x"),
         (("localise", "TOWN", "STREET", "--config", "CALIBRATION"), "unknown setting"),
@@ -207,7 +208,7 @@ def test_settings_come_from_toml_and_are_kept(engram, street: Path, tmp_path: Pa
         (("map", "CALIBRATION", "STREET"), "calibration.toml"),
         (("map", "no/such/folder/a.engram", "STREET"), "no/such/folder"),
         (("map", "TOWN", "STREET", "--recorded-at", "yesterday"), "yesterday"),
-        (("map", "TOWN", "STREET", "--longitude", 400), "400"),
+        (("map", "TOWN", "STREET", "--set", "drive.longitude_deg=400"), "400"),
         (("record", "STREET", "no/such/folder/a.framelog"), "no/such/folder"),
         (("info", "STREET"), "street"),
         (("map", "TOWN", "STREET", "--features", "sift"), "sift"),
@@ -240,7 +241,9 @@ def test_a_bad_image_stops_the_drive_or_is_skipped_and_counted(
     ran = engram("map", tmp_path / "a.engram", broken)
     assert ran.status == 2
     assert "000005.png" in ran.err
-    report = engram("map", tmp_path / "b.engram", broken, "--skip-bad", "--json").json
+    report = engram(
+        "map", tmp_path / "b.engram", broken, "--set", "drive.skip_bad=true", "--json"
+    ).json
     assert report["skipped_pairs"] == 1
     assert report["frames"] == 11
 

@@ -396,9 +396,9 @@ def test_the_front_compares_the_gyroscope_with_odometry(pairs, factor: float) ->
 
 def test_the_clock_names_only_what_is_missing(pairs) -> None:
     for facts, cure in (
-        (Facts(clock=Clock.UTC), "give --zone or --longitude"),
-        (Facts(clock=Clock.RELATIVE, zone="Europe/London"), "give --recorded-at"),
-        (Facts(clock=Clock.RELATIVE), "give --recorded-at and --zone or --longitude"),
+        (Facts(clock=Clock.UTC), "give drive.zone"),
+        (Facts(clock=Clock.RELATIVE, zone="Europe/London"), "give drive.recorded_at"),
+        (Facts(clock=Clock.RELATIVE), "give drive.recorded_at and drive.zone"),
     ):
         (note,) = [one for one in examined(pairs, facts).findings if one.code == "clock_unstated"]
         assert note.cure == f"for downloads by hour {cure}"

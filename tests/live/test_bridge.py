@@ -466,7 +466,7 @@ def pairs(street: Path) -> list[StereoPair]:
 def watched(street: Path, tmp_path: Path) -> Iterator[Watched]:
     path = tmp_path / "street.engram"
     map_drive(path, open_drive(street, frames="0:12:2"))
-    made = Watched([*LIVE, str(path), "--lanes", "1", "--rounds", "4"])
+    made = Watched([*LIVE, str(path), "--set", "drive.lanes=1", "--set", "drive.rounds=4"])
     yield made
     made.supervisor.close()
 

@@ -43,7 +43,7 @@ def test_lanes_and_threads_are_as_the_settings_say(
     file = tmp_path / "robot.toml"
     file.write_text("[drive]\nlanes = 3\nthreads = 4\n")
     asked = ("lab", "relocalise", town, street)
-    for options in ((), ("--config", file), ("--config", file, "--lanes", 1)):
+    for options in ((), ("--config", file), ("--config", file, "--set", "drive.lanes=1")):
         assert engram(*asked, *options).status == 0
     assert calls == [(2, 2), (3, 2), (1, 1)]
 

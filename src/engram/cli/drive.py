@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from engram.cli import options
-from engram.cli.options import VerbInFull, VerbInterruptedError, untrusted_if
+from engram.cli.options import VerbInterruptedError, untrusted_if
 from engram.counts import counted
 from engram.errors import ConfigError
 
@@ -34,11 +34,12 @@ drive_group = typer.Typer(
 )
 
 
-@drive_group.command("info", cls=VerbInFull)
+@drive_group.command("info")
 def info(
     path: options.DrivePath,
     *,
-    opening: options.Drive,
+    opening: options.Seen,
+    settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
     """Show what a drive holds, and how to map it.
@@ -54,17 +55,20 @@ def info(
     from engram.config import plain
     from engram.sequences.bags.bag_sequence import describe_bag
     from engram.sequences.bags.containers import is_bag
+    from engram.sequences.sequence import OpenOptions
 
-    if is_bag(path) and opening.format in {None, "bag"}:
-        facts = describe_bag(path, opening.options())
-        if facts.command and (more := opening.typed("left", "right", "calibration", "motion")):
+    if is_bag(path):
+        options = OpenOptions.of(opening.over(settings.read()))
+        facts = describe_bag(path, options)
+        more = [*opening.typed("left", "right", "calibration", "motion"), *settings.typed()]
+        if facts.command and more:
             facts = replace(facts, command=f"{facts.command} {shlex.join(more)}")
         typer.echo(json.dumps(plain(facts)) if as_json else _bag_text(facts))
         if facts.lost or facts.question:
             raise typer.Exit(3 if facts.lost else 2)
         _judge(facts.faulty_share)
         return
-    found = _drive_facts(path, opening)
+    found = _drive_facts(path, opening, settings)
     typer.echo(json.dumps(found) if as_json else _drive_text(found))
     _judge(found["faulty_share"])
 
@@ -77,11 +81,11 @@ def _judge(faulty_share: float) -> None:
         raise typer.Exit(3)
 
 
-@drive_group.command("calibration", cls=VerbInFull)
+@drive_group.command("calibration")
 def calibration(
     path: options.DrivePath,
     *,
-    opening: options.Drive,
+    opening: options.Seen,
     picture: Annotated[
         Path | None,
         typer.Option(
@@ -91,6 +95,7 @@ def calibration(
             parser=options.output_file,
         ),
     ] = None,
+    settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
     """Show a drive's calibration, and draw a rectified pair.
@@ -102,7 +107,7 @@ def calibration(
     \b
     Examples:
       engram drive calibration monday.bag > calibration.toml
-      engram drive calibration monday.bag --calibration calibration.toml --field-of-view 90
+      engram drive calibration monday.bag --calibration calibration.toml
     """
     import cv2
 
@@ -113,7 +118,7 @@ def calibration(
     from engram.untrusted import printable
     from engram.viewing.pictures import rectified_picture, row_offsets_px
 
-    sequence = opening.open(path)
+    sequence, _ = opening.open(path, settings)
     if isinstance(sequence, FrameLog):
         raise ConfigError(f"{path}: a frame log has no images to calibrate; name its drive")
     pair = next(iter(sequence))
@@ -221,11 +226,13 @@ def _size(size_bytes: int) -> str:
     return f"{size_bytes / 1e6:.1f} MB" if size_bytes >= 1e5 else f"{size_bytes / 1e3:.1f} kB"
 
 
-def _drive_facts(path: Path, opening: options.Drive) -> dict[str, Any]:
+def _drive_facts(
+    path: Path, opening: options.Seen, settings: options.SettingsGiven
+) -> dict[str, Any]:
     from engram.sequences.layouts import ImageSequence
     from engram.sequences.opening import stamps_of
 
-    sequence = opening.open(path)
+    sequence, _ = opening.open(path, settings)
     stamps_ns = getattr(sequence, "stamps_ns", None)
     seconds = 0.0 if stamps_ns is None else float(stamps_ns[-1] - stamps_ns[0]) / 1e9
     return {
@@ -238,7 +245,9 @@ def _drive_facts(path: Path, opening: options.Drive) -> dict[str, Any]:
         "notes": list(sequence.cameras.notes) if isinstance(sequence, ImageSequence) else [],
         "stamps": getattr(sequence, "stamp_facts", []),
         "faulty_share": stamps_of(sequence).faulty_share,
-        "command": shlex.join(["engram", "map", "MAP.engram", str(path), *opening.typed()]),
+        "command": shlex.join(
+            ["engram", "map", "MAP.engram", str(path), *opening.typed(), *settings.typed()]
+        ),
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -87,9 +86,7 @@ def map_(
     path: options.DrivePath,
     *,
     drive: options.Drive,
-    effort: options.Effort,
     features: options.Features = None,
-    no_thumbnails: options.NoThumbnails = False,
     force: Annotated[
         bool, typer.Option("--force", help="Map the drive even if the doctor finds it unfit.")
     ] = False,
@@ -110,16 +107,15 @@ def map_(
       engram map town.engram drives/tuesday --recorded-at 2026-03-01T09:30:00Z
       engram map town.engram sequences/06 --frames 0:50:2
     """
-    sequence = drive.open(path)
+    sequence, given = drive.open(path, settings)
     from engram.cli.screen import Bars
     from engram.cli.wording import mapped_text, warnings
     from engram.robot.mapping import Beginning, map_drive
     from engram.robot.settings import RobotOptions
     from engram.viewing.viewer import viewer_for
 
-    given = settings.read()
-    asked = RobotOptions(**effort.over(given), force=force)
-    resolved = _for_people(given.of_robot(features), no_thumbnails)
+    asked = RobotOptions(**options.Effort().over(given), force=force)
+    resolved = given.of_robot(features)
     features = features or _asked_kind(resolved)
     with losses_told(sequence):
         with viewer_for(view) as viewer, Bars().stage("map", len(sequence)) as monitor:
@@ -143,15 +139,16 @@ def localise(
     map_path: options.MapPath,
     path: options.DrivePath,
     *,
-    drive: options.Drive,
+    drive: options.Seen,
     effort: options.Effort,
     deadline: Annotated[
         float | None,
         typer.Option(
-            "--deadline", metavar="MS", help="Start no attempt later than this after the frame."
+            "--deadline",
+            metavar="MS",
+            help="Start no attempt later than this after the frame.",
         ),
     ] = None,
-    relocaliser: options.Relocaliser = "fabmap",
     at: options.At = None,
     trajectory: Annotated[
         Path | None,
@@ -173,11 +170,18 @@ def localise(
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option("--rate", metavar="HZ", help="Replay in real time and count late frames."),
+        typer.Option(
+            "--rate",
+            metavar="HZ",
+            help="Replay in real time and count late frames.",
+            hidden=True,
+        ),
     ] = None,
     remember: Annotated[
         bool,
-        typer.Option("--remember", help="Keep the drive's path and attempts in the map."),
+        typer.Option(
+            "--remember", help="Keep the drive's path and attempts in the map.", hidden=True
+        ),
     ] = False,
     recorder: Annotated[
         Path | None,
@@ -185,11 +189,14 @@ def localise(
             "--recorder",
             metavar="DIR",
             help="When lost, write the last 30 s to a file.",
+            hidden=True,
             parser=options.output_folder,
         ),
     ] = None,
-    no_images: Annotated[bool, typer.Option("--no-images", help="Record no images.")] = False,
-    view: options.View = None,
+    no_images: Annotated[
+        bool, typer.Option("--no-images", help="Record no images.", hidden=True)
+    ] = False,
+    view: options.RareView = None,
     explain: Annotated[
         int | None,
         typer.Option(
@@ -212,23 +219,21 @@ def localise(
     \b
     Examples:
       engram localise town.engram drives/tuesday
-      engram localise town.engram drives/tuesday --ranking distance --lanes 1 --json
+      engram localise town.engram drives/tuesday --ranking distance --json
       engram localise town.engram drives/tuesday --rate 20 --deadline 40
       engram localise town.engram drives/tuesday --trajectory tuesday.tum --pictures matches
       engram localise town.engram drives/tuesday --view window
       engram localise town.engram drives/tuesday --explain 120
     """
-    sequence = drive.open(path)
+    sequence, given = drive.open(path, settings)
     from engram.cli.localising import Outputs, explain_and_print, localise_and_print
     from engram.maps.map import open_map
     from engram.robot.explaining import ExplainOptions
     from engram.robot.settings import RobotOptions
 
-    found_by = None if relocaliser == "none" else relocaliser
-    given = settings.read()
     resolved, tried = given.of_robot(), effort.over(given)
     if explain is None:
-        asked = RobotOptions(**tried, deadline_ms=deadline, relocaliser=found_by)
+        asked = RobotOptions(**tried, deadline_ms=deadline)
         wanted = Outputs(
             map_path, trajectory, pictures, rate, as_json, remember, recorder, not no_images, view
         )
@@ -244,7 +249,8 @@ def localise(
     }  # fmt: skip
     for option in (option for option, value in refused.items() if value is not None):
         raise ConfigError(f"--explain is about one frame and takes no {option}")
-    frame = ExplainOptions(explain, tried["ranking"], tried["lanes"], tried["rounds"], found_by, at)
+    names = ("ranking", "lanes", "rounds", "relocaliser")
+    frame = ExplainOptions(explain, **{name: tried[name] for name in names}, at=at)
     explain_and_print(map_path, sequence, resolved, frame, as_json=as_json)
 
 
@@ -271,13 +277,13 @@ def record(
     \b
     Examples:
       engram record drives/monday monday.framelog
-      engram record 2011_09_26_drive_0001_sync colour.framelog --rig colour --channel blue
+      engram record 2011_09_26_drive_0001_sync colour.framelog --set drive.rig=colour
     """
-    sequence = drive.open(path)
+    sequence, given = drive.open(path, settings)
     from engram.cli.screen import Bars
     from engram.robot.mapping import extract_log
 
-    resolved = settings.read().of_robot(features)
+    resolved = given.of_robot(features)
     with losses_told(sequence):
         with Bars().stage("record", len(sequence)) as monitor:
             report = extract_log(sequence, out, resolved, monitor)
@@ -324,19 +330,13 @@ def _empty(opened: Map) -> str:
     return "warning: the map is empty; begin it with engram map"
 
 
-def _for_people(settings: Settings, no_thumbnails: bool) -> Settings:
-    if not no_thumbnails:
-        return settings
-    return replace(settings, frontend=replace(settings.frontend, thumbnails=False))
-
-
 _PICTURES = 4
 
 
 def doctor(
     path: options.DrivePath,
     *,
-    drive: options.Drive,
+    drive: options.Seen,
     hours: Annotated[
         bool, typer.Option("--hours", help="Check the clock, which missions by hour need.")
     ] = False,
@@ -362,14 +362,15 @@ def doctor(
     Examples:
       engram doctor drives/monday
       engram doctor drives/monday --json --pictures looks
-      engram doctor drives/monday --hours --zone Europe/London
+      engram doctor drives/monday --hours --set drive.zone=Europe/London
     """
     from engram.cli.screen import Bars
     from engram.robot.mapping import examine_drive
     from engram.sequences.sequence import LoggedFrame
 
-    sequence = dataclasses.replace(drive, skip_bad=True).open(path)
-    resolved = settings.read().of_robot()
+    changes = [*(settings.changes or ()), "drive.skip_bad=true"]
+    sequence, given = drive.open(path, replace(settings, changes=changes))
+    resolved = given.of_robot()
     most = min(len(sequence), resolved.doctor.frames)
     with losses_told(sequence):
         with Bars().stage("doctor", most) as monitor:
@@ -401,7 +402,7 @@ def _draw(folder: Path, pairs: list[StereoPair]) -> None:
 def _draw_fixed(
     folder: Path, pairs: list[StereoPair], diagnosis: Diagnosis, cameras: Cameras | None
 ) -> None:
-    """Writes what moves with the camera, as a picture and as a file for --mask."""
+    """Writes what moves with the camera, as a picture and as a file for `drive.mask`."""
     from engram.sequences.calibrating import mask_image
     from engram.viewing.pictures import fixed_picture
 

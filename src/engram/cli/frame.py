@@ -26,15 +26,6 @@ class GoalAction(StrEnum):
     REMOVE = "remove"
 
 
-class ExportFormat(StrEnum):
-    """Formats of an export."""
-
-    TUM = "tum"
-    KITTI = "kitti"
-    CSV = "csv"
-    GEOJSON = "geojson"
-
-
 def anchor(
     map_path: options.MapPath,
     positions: Annotated[
@@ -113,9 +104,6 @@ def goal(
         float,
         typer.Option("--yaw", metavar="DEG", help="add: direction in degrees, from x towards y."),
     ] = 0.0,
-    at: Annotated[
-        str | None, typer.Option("--at", metavar="REV", help="list: read this revision.")
-    ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Store poses in a map, list or remove them.
@@ -137,7 +125,7 @@ def goal(
     from engram.robot.anchors import add_goal, list_goals, remove_goal
 
     if action is GoalAction.LIST:
-        found = list_goals(map_path, at)
+        found = list_goals(map_path)
         if as_json:
             print(json.dumps({"goals": found}))
         for one in [] if as_json else found:
@@ -187,14 +175,6 @@ def export(
         ),
     ],
     *,
-    form: Annotated[
-        ExportFormat | None,
-        typer.Option(
-            "--format",
-            metavar="NAME",
-            help="tum, kitti, csv or geojson [default: by FILE's suffix].",
-        ),
-    ] = None,
     at: options.At = None,
     as_json: options.Json = False,
 ) -> None:
@@ -205,11 +185,11 @@ def export(
     \b
     Examples:
       engram export town.engram town.csv
-      engram export town.engram poses.txt --format tum
+      engram export town.engram before.tum --at 3
     """
     from engram.robot.inspecting import export_map
 
-    wrote = export_map(map_path, out, None if form is None else form.value, at)
+    wrote = export_map(map_path, out, at=at)
     if as_json:
         typer.echo(json.dumps({"nodes": wrote.nodes, "goals": wrote.goals, "file": str(out)}))
         return

@@ -29,9 +29,6 @@ def log(
     map_path: options.MapPath,
     *,
     oneline: Annotated[bool, typer.Option("--oneline", help="Print one line each.")] = False,
-    limit: Annotated[
-        int | None, typer.Option("--limit", "-n", metavar="N", min=1, help="Only the newest N.")
-    ] = None,
     at: options.At = None,
     as_json: options.Json = False,
 ) -> None:
@@ -40,12 +37,12 @@ def log(
     \b
     Examples:
       engram log town.engram
-      engram log town.engram --oneline --limit 10
+      engram log town.engram --oneline --at 10
       engram log town.engram --json
     """
     from engram.maps.history import log_text, map_log
 
-    revisions = map_log(map_path, at)[:limit]
+    revisions = map_log(map_path, at)
     if as_json:
         print(json.dumps(revisions))
         return
@@ -100,9 +97,6 @@ def diff(
     before: Revision,
     after: Revision = "head",
     *,
-    stretch: Annotated[
-        float, typer.Option("--stretch", metavar="M", help="Length of the listed stretches.")
-    ] = 50.0,
     picture: Annotated[
         Path | None,
         typer.Option(
@@ -128,7 +122,7 @@ def diff(
     from engram.viewing.pictures import draw_difference
 
     with open_map(map_path) as town:
-        found = town.diff(before, after, stretch)
+        found = town.diff(before, after)
     if picture is not None:
         draw_difference(map_path, found, picture)
     typer.echo(json.dumps(found.to_dict()) if as_json else found.text())

@@ -316,9 +316,6 @@ def vocabulary(
     words: Annotated[
         int, typer.Option("--words", metavar="N", help="train: number of words.")
     ] = 10_000,
-    at: Annotated[
-        str | None, typer.Option("--at", metavar="REV", help="show: read this revision.")
-    ] = None,
     as_json: options.Json = False,
 ) -> None:
     """Train, copy or show a map's visual words.
@@ -340,7 +337,7 @@ def vocabulary(
     from engram.robot.vocabularies import describe_vocabulary, train_map_vocabulary, use_vocabulary
 
     if action is VocabularyAction.SHOW:
-        report = describe_vocabulary(map_path, at)
+        report = describe_vocabulary(map_path)
     elif action is VocabularyAction.USE:
         if not sources or len(sources) != 1:
             raise InputError(
@@ -377,7 +374,7 @@ def view(
     *,
     view: options.Viewed = Path("window"),
     at: options.At = None,
-    drive: options.Drive,
+    drive: options.Seen,
     settings: options.SettingsGiven,
 ) -> None:
     """Look at a map, and at a drive in it.
@@ -401,7 +398,7 @@ def view(
         if path is None:
             viewer.show(opened)
         else:
-            sequence, given = drive.open(path), settings.read()
+            sequence, given = drive.open(path, settings)
             asked = options.driving_of(given)
             with (
                 robot_on(opened, sequence, given.of_robot(), asked) as robot,

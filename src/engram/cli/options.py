@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 import inspect
@@ -10,11 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias
 
 import typer
+from msgspec import Meta
 from typer.core import TyperCommand
 
+from engram.drive_options import DriveOptions
 from engram.errors import EngramError, InputError, SequenceError
 from engram.files import check_output, check_output_folder, check_there, map_path
 
@@ -23,20 +26,23 @@ if TYPE_CHECKING:
     from engram.doctor.table import Finding
     from engram.robot.settings import RobotOptions
     from engram.sequences.opening import Drive as OpenDrive
-    from engram.sequences.sequence import OpenOptions
 
 
-# In an option's help: the names of all layouts, which only the help itself is worth importing for.
-LAYOUTS = "LAYOUTS"
 # Widest first column of a table; a longer one has its meaning on the next line.
 _COLUMN = 27
+# Key of a context's `meta`: whether its help explains every option.
+_ALL = "engram.all"
 
 
 class Verb(TyperCommand):
-    """A verb whose help names the options that few drives need without explaining them."""
+    """A verb whose help explains the usual options, and the others with `--all`."""
 
-    # Where those are explained.
-    _EXPLAINED = "Also for drives, explained by engram drive info --help"
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Takes `--all` out of a request for help."""
+        if "--all" in args and not {"--help", "-h"}.isdisjoint(args):
+            ctx.meta[_ALL] = True
+            args = [word for word in args if word != "--all"]
+        return super().parse_args(ctx, args)
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """The arguments in the line of usage."""
@@ -46,33 +52,24 @@ class Verb(TyperCommand):
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Tables of arguments and options, and the names of the options that are not explained."""
-        arguments, options, others = [], [], []
-        for one in self.get_params(ctx):
-            if one.param_type_name == "argument":
-                arguments.append((_typed(one), _meaning(one, ctx)))
-            elif self._explains(one):
-                options.append((one, ctx))
-            else:
-                others.append(one.opts[0])
+        taken: list[Any] = self.get_params(ctx)
+        arguments = [one for one in taken if one.param_type_name == "argument"]
+        usual = [one for one in taken if one not in arguments and not one.hidden]
+        more = [one for one in taken if one not in arguments and one.hidden]
         if arguments:
             with formatter.section("Arguments"):
-                formatter.write_dl(arguments, col_max=_COLUMN)
+                rows = [(_typed(one), _meaning(one, ctx)) for one in arguments]
+                formatter.write_dl(rows, col_max=_COLUMN)
         with formatter.section("Options"):
-            formatter.write_dl([_record(*one) for one in options], col_max=_COLUMN)
-        if others:
-            with formatter.section(self._EXPLAINED):
-                formatter.write_text(" ".join(others))
-
-    def _explains(self, option: Any) -> bool:
-        return not option.hidden
-
-
-class VerbInFull(Verb):
-    """A verb whose help explains those options, too."""
-
-    def _explains(self, option: Any) -> bool:
-        option.hidden = False
-        return True
+            formatter.write_dl([_record(one, ctx) for one in usual], col_max=_COLUMN)
+        if not more:
+            return
+        with formatter.section("More options"):
+            if ctx.meta.get(_ALL):
+                formatter.write_dl([_record(one, ctx) for one in more], col_max=_COLUMN)
+            else:
+                formatter.write_text(" ".join(one.opts[0] for one in more))
+                formatter.write_text(f"{ctx.command_path} --help --all explains them")
 
 
 def _typed(argument: Any) -> str:
@@ -87,11 +84,9 @@ def _meaning(argument: Any, ctx: Any) -> str:
 
 
 def _record(parameter: Any, ctx: Any) -> tuple[str, str]:
-    typed, meaning = parameter.get_help_record(ctx)
-    if LAYOUTS in meaning:
-        from engram.sequences.opening import layout_names
-
-        meaning = meaning.replace(LAYOUTS, ", ".join(layout_names()))
+    shown = copy.copy(parameter)
+    shown.hidden = False
+    typed, meaning = shown.get_help_record(ctx)
     return typed, " ".join(meaning.split()).replace("]. [", "; ")
 
 
@@ -107,11 +102,6 @@ def map_file(text: str) -> Path:
         raise typer.BadParameter(str(error)) from error
 
 
-def _british(word: str) -> str:
-    """Both spellings of a rig's or a channel's name."""
-    return {"color": "colour", "gray": "grey"}.get(word, word)
-
-
 MapPath: TypeAlias = Annotated[
     Path, typer.Argument(metavar="MAP", help="A map, NAME.engram.", parser=map_file)
 ]
@@ -124,23 +114,6 @@ At: TypeAlias = Annotated[
     str | None,
     typer.Option("--at", metavar="REV", help="Read this revision: 7, a tag, head~2."),
 ]
-Lanes: TypeAlias = Annotated[
-    int, typer.Option("--lanes", metavar="N", min=1, help="Match attempts in parallel (Np).")
-]
-Rounds: TypeAlias = Annotated[
-    int,
-    typer.Option(
-        "--rounds", metavar="N", min=1, help="Rounds of attempts per frame (Nr); 32 when lost."
-    ),
-]
-Relocaliser: TypeAlias = Annotated[
-    str,
-    typer.Option(
-        "--relocaliser",
-        metavar="NAME",
-        help="How a lost robot is found: fabmap, signature (net), bag-of-words, exhaustive, none",
-    ),
-]
 Features: TypeAlias = Annotated[
     str | None,
     typer.Option(
@@ -148,9 +121,6 @@ Features: TypeAlias = Annotated[
         metavar="KIND",
         help="Features of a new map or log; engram features list [default: brief].",
     ),
-]
-NoThumbnails: TypeAlias = Annotated[
-    bool, typer.Option("--no-thumbnails", help="Store no small pictures with the nodes.")
 ]
 Settings: TypeAlias = Annotated[
     Path | None,
@@ -160,155 +130,32 @@ Settings: TypeAlias = Annotated[
 ]
 
 
-@dataclass(frozen=True, slots=True)
-class Drive:
-    """How a drive is read."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drive(DriveOptions):
+    """How a drive is read; what is not given comes from the table `drive` of the settings."""
 
-    format: Annotated[
-        str | None,
-        typer.Option(
-            "--format",
-            metavar="NAME",
-            help=f"{LAYOUTS} [default: detected].",
-        ),
-    ] = None
-    rig: Annotated[
-        str,
-        typer.Option(
-            "--rig",
-            metavar="RIG",
-            help="KITTI's cameras: grey or colour.",
-            parser=_british,
-            hidden=True,
-        ),
-    ] = "grey"
-    channel: Annotated[
-        str,
-        typer.Option(
-            "--channel",
-            metavar="CHANNEL",
-            help="What is taken of colour images: grey, red, green or blue.",
-            parser=_british,
-            hidden=True,
-        ),
-    ] = "grey"
-    frames: Annotated[
-        str | None,
-        typer.Option("--frames", metavar="START:STOP:STEP", help="Only these frames: 0:100:2."),
-    ] = None
-    skip_bad: Annotated[
-        bool,
-        typer.Option("--skip-bad", help="Skip and count unreadable images.", hidden=True),
-    ] = False
-    robot: Annotated[
-        str | None,
-        typer.Option("--robot", metavar="NAME", help="Name of the robot [default: the drive's]."),
-    ] = None
-    recorded_at: Annotated[
-        str | None,
-        typer.Option("--recorded-at", metavar="TIME", help="Start of the drive in ISO 8601, UTC."),
-    ] = None
-    longitude: Annotated[
-        float | None,
-        typer.Option(
-            "--longitude", metavar="DEG", help="Degrees east, for solar time.", hidden=True
-        ),
-    ] = None
-    zone: Annotated[
-        str | None,
-        typer.Option("--zone", metavar="ZONE", help="Time zone of the drive: Europe/London."),
-    ] = None
-    from_: Annotated[
-        str | None,
-        typer.Option(
-            "--from",
-            metavar="TIME",
-            help="Begin here: seconds into the drive, or ISO 8601, UTC.",
-            hidden=True,
-        ),
-    ] = None
-    to: Annotated[
-        str | None, typer.Option("--to", metavar="TIME", help="End here.", hidden=True)
-    ] = None
-    calibration: Annotated[
-        Path | None,
-        typer.Option("--calibration", metavar="FILE", help="TOML, Kalibr, ROS or OpenCV file."),
-    ] = None
-    field_of_view: Annotated[
-        float | None,
-        typer.Option(
-            "--field-of-view",
-            metavar="DEG",
-            help="Field of view of the rectified images [default: the widest].",
-            hidden=True,
-        ),
-    ] = None
-    mask: Annotated[
-        Path | None,
-        typer.Option(
-            "--mask",
-            metavar="PNG",
-            help="Image that is black where the robot sees itself.",
-            hidden=True,
-        ),
-    ] = None
-    left: Annotated[
-        str | None,
-        typer.Option("--left", metavar="TOPIC", help="Topic of a bag's left images.", hidden=True),
-    ] = None
-    right: Annotated[
-        str | None,
-        typer.Option(
-            "--right", metavar="TOPIC", help="Topic of a bag's right images.", hidden=True
-        ),
-    ] = None
-    motion: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--motion",
-            metavar="TOPIC|FILE",
-            help="Wheel odometry or gyroscope; repeatable.",
-            hidden=True,
-        ),
-    ] = None
+    taken: ClassVar[tuple[str, ...]] = (
+        "frames", "robot", "recorded_at", "zone", "calibration", "left", "right", "motion",
+    )  # fmt: skip
 
-    def open(self, path: Path) -> OpenDrive:
-        """The drive; see `engram.open_drive` for the errors."""
+    def open(self, path: Path, settings: SettingsGiven) -> tuple[OpenDrive, AllSettings]:
+        """The drive and the resolved settings; see `engram.open_drive` for the errors."""
         check_there(path, SequenceError)  # before half a second of imports
 
         from engram.sequences.opening import open_with
 
-        return open_with(path, self.options(), self.format)
+        resolved = settings.read()
+        return open_with(path, self.over(resolved)), resolved
 
-    def options(self) -> OpenOptions:
-        """How it is opened; see `OpenOptions` for the errors."""
-        from engram.sequences.sequence import (
-            Channel,
-            FrameRange,
-            OpenOptions,
-            Rig,
-            TimeRange,
-            parse_choice,
-            parse_time,
-        )
+    def over(self, settings: AllSettings) -> DriveOptions:
+        """The options as given, else as in the settings."""
+        names = [one.name for one in dataclasses.fields(DriveOptions)]
+        resolved = {name: getattr(settings.drive, name) for name in names}
+        return DriveOptions(**{**resolved, **self._given()})
 
-        return OpenOptions(
-            rig=parse_choice(Rig, self.rig),
-            channel=parse_choice(Channel, self.channel),
-            frames=FrameRange() if self.frames is None else FrameRange.parse(self.frames),
-            times=TimeRange.parse(self.from_, self.to),
-            skip_bad=self.skip_bad,
-            robot=self.robot,
-            recorded_at_ns=parse_time("--recorded-at", self.recorded_at),
-            longitude_deg=self.longitude,
-            zone=self.zone,
-            calibration=self.calibration,
-            field_of_view_deg=self.field_of_view,
-            mask=self.mask,
-            left=self.left,
-            right=self.right,
-            motion=tuple(self.motion or ()),
-        )
+    def _given(self) -> dict[str, Any]:
+        values = {one.name: getattr(self, one.name) for one in _declared_options(type(self))}
+        return {name: value for name, value in values.items() if value not in (None, (), [])}
 
     def typed(self, *besides: str) -> list[str]:
         """The options that were given, as words of a command.
@@ -317,21 +164,25 @@ class Drive:
             besides: names of fields that are left out.
         """
         words: list[str] = []
-        for one in dataclasses.fields(self):
-            value, option = getattr(self, one.name), f"--{one.name.strip('_').replace('_', '-')}"
-            if value == one.default or one.name in besides:
-                continue
-            if value is True:
-                words.append(option)
-            else:
-                several = value if isinstance(value, list) else [value]
-                words += [word for each in several for word in (option, str(each))]
+        for name, value in self._given().items():
+            several = value if isinstance(value, list) else [value]
+            if name not in besides:
+                words += [word for each in several for word in (_flag(name), str(each))]
         return words
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Seen(Drive):
+    """How a drive is read that is not kept: without when it was driven."""
+
+    taken: ClassVar[tuple[str, ...]] = (
+        "frames", "robot", "calibration", "left", "right", "motion",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """Ranking and budget of a drive; what is not given comes from the settings."""
+    """How a robot drives; what is not given comes from the table `drive` of the settings."""
 
     ranking: Annotated[
         str | None,
@@ -339,32 +190,19 @@ class Effort:
             "--ranking",
             metavar="NAME",
             help="Which nodes to try first: recall, path, distance, … [default: recall].",
-        ),
-    ] = None
-    lanes: Annotated[
-        int | None,
-        typer.Option(
-            "--lanes", metavar="N", min=1, help="Match attempts in parallel (Np) [default: 2]."
-        ),
-    ] = None
-    rounds: Annotated[
-        int | None,
-        typer.Option(
-            "--rounds",
-            metavar="N",
-            min=1,
-            help="Rounds of attempts per frame (Nr); 32 when lost [default: 2].",
+            hidden=True,
         ),
     ] = None
 
     def over(self, settings: AllSettings) -> dict[str, Any]:
-        """Ranking, lanes, rounds and threads: as given, else as in the settings."""
+        """How a robot drives: as given, else as in the settings."""
         drive = settings.drive
         return {
             "ranking": self.ranking or drive.ranking,
-            "lanes": self.lanes or drive.lanes,
-            "rounds": self.rounds or drive.rounds,
+            "lanes": drive.lanes,
+            "rounds": drive.rounds,
             "threads": drive.threads,
+            "relocaliser": None if drive.relocaliser == "none" else drive.relocaliser,
         }
 
 
@@ -391,6 +229,11 @@ class SettingsGiven:
 
         return read_settings(self.config, self.changes or ())
 
+    def typed(self) -> list[str]:
+        """The options as words of a command."""
+        words = [] if self.config is None else ["--config", str(self.config)]
+        return [*words, *(word for one in self.changes or () for word in ("--set", one))]
+
 
 def spread(verb: Callable[..., None]) -> Callable[..., None]:
     """Replaces each dataclass among a verb's parameters by its fields, one option each."""
@@ -408,7 +251,7 @@ def spread(verb: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(verb)
     def run(*arguments: Any, **given: Any) -> None:
         for name, kind in groups.items():
-            names = [one.name for one in dataclasses.fields(kind)]
+            names = [one.name for one in _declared_options(kind)]
             given[name] = kind(**{option: given.pop(option) for option in names})
         verb(*arguments, **given)
 
@@ -424,10 +267,34 @@ def _options_of(group: Any) -> list[inspect.Parameter]:
             one.name,
             inspect.Parameter.KEYWORD_ONLY,
             default=inspect.Parameter.empty if one.default is dataclasses.MISSING else one.default,
-            annotation=kinds[one.name],
+            annotation=_as_option(one.name, kinds[one.name]),
         )
-        for one in dataclasses.fields(group)
+        for one in _declared_options(group)
     ]
+
+
+def _declared_options(group: Any) -> list[Any]:
+    """The fields of a group that are options of the verbs which take it: all, or some."""
+    fields = dataclasses.fields(group)
+    return [one for one in fields if one.name in getattr(group, "taken", {one.name})]
+
+
+def _as_option(name: str, kind: Any) -> Any:
+    """A field's annotation as Typer takes it: made of a `Meta` that has a `metavar`."""
+    for mark in kind.__metadata__:
+        if isinstance(mark, Meta) and mark.extra:
+            metavar, rare = mark.extra["metavar"], mark.extra["rare"]
+            option = typer.Option(_flag(name), metavar=metavar, help=mark.description, hidden=rare)
+            return Annotated[_TYPED.get(name, str | None), option]
+    return kind
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+# What is typed as something else than text.
+_TYPED: dict[str, Any] = {"calibration": Path | None, "motion": list[str] | None}
 
 
 class OutputError(EngramError):
@@ -498,14 +365,21 @@ WrittenFleetMap: TypeAlias = Annotated[
         parser=output_fleet_map,
     ),
 ]
-_VIEW = typer.Option(
-    "--view",
-    metavar="window|FILE.rrd",
-    help="Watch it in Rerun, or write a recording.",
-    parser=output_recording,
-)
-View: TypeAlias = Annotated[Path | None, _VIEW]
-Viewed: TypeAlias = Annotated[Path, _VIEW]
+
+
+def _view(*, rare: bool = False) -> Any:
+    return typer.Option(
+        "--view",
+        metavar="window|FILE.rrd",
+        help="Watch it in Rerun, or write a recording.",
+        parser=output_recording,
+        hidden=rare,
+    )
+
+
+View: TypeAlias = Annotated[Path | None, _view()]
+RareView: TypeAlias = Annotated[Path | None, _view(rare=True)]
+Viewed: TypeAlias = Annotated[Path, _view()]
 
 
 class ExitStatus(IntEnum):

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from engram.config import PUBLIC, check_bounds, from_dict, read_toml, to_dict
+from engram.drive_options import DriveOptions
 from engram.errors import ConfigError
 from engram.fleet.settings import BuildSettings, DownloadSettings, MergeSettings
 from engram.frontend.frame import DescriptorKind
@@ -23,12 +24,12 @@ from engram.robot.anchors import IslandsConfig
 from engram.robot.settings import Settings, settings_text
 
 
-@dataclass(frozen=True, slots=True)
-class DriveSettings:
-    """How `map` and `localise` attempt; options of the command count before them."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriveSettings(DriveOptions):
+    """How drives are opened, and how `map` and `localise` attempt; options count before them."""
 
     ranking: Annotated[
-        str, Meta(description="which nodes to try first: recall, path, path-near, distance"), PUBLIC
+        str, Meta(description="which nodes to try first: recall, path, distance"), PUBLIC
     ] = "recall"
     lanes: Annotated[
         int, Meta(ge=1, description="attempts in parallel, Np. [L15] Fig. 3"), PUBLIC
@@ -48,6 +49,11 @@ class DriveSettings:
         ]
         | None
     ) = None
+    relocaliser: Annotated[
+        str,
+        Meta(description="finds a lost robot: fabmap, signature (net), exhaustive, none"),
+        PUBLIC,
+    ] = "fabmap"
 
     def __post_init__(self) -> None:
         check_bounds(self)

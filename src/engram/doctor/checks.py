@@ -299,8 +299,8 @@ def hour_given_by(seen: Evidence) -> str:
     """The options that determine the hour of the drive."""
     facts = seen.facts
     nowhere = facts.zone is None and facts.longitude_deg is None
-    asked = ["--recorded-at"] if facts.clock is not Clock.UTC else []
-    return "give " + " and ".join(asked + ["--zone or --longitude"] * nowhere)
+    asked = ["drive.recorded_at"] if facts.clock is not Clock.UTC else []
+    return "give " + " and ".join(asked + ["drive.zone"] * nowhere)
 
 
 def hours_needed(seen: Evidence) -> float | None:

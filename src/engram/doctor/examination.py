@@ -265,7 +265,7 @@ class DoctorConfig:
     row_jump_px: Annotated[float, Meta(gt=0)] = 0.25
     row_offset_px: Annotated[float, Meta(gt=0), PUBLIC] = 1.3
     slight_row_offset_px: Annotated[float, Meta(gt=0)] = 0.8
-    no_odometry: Annotated[float, Meta(gt=0, lt=1), PUBLIC] = 0.5
+    no_odometry: Annotated[float, Meta(gt=0, lt=1)] = 0.5
     frozen_frames: Annotated[int, Meta(ge=1)] = 2
     equal_share: Annotated[float, Meta(gt=0, le=1)] = 0.9
     fixed_share: Annotated[float, Meta(ge=0, lt=1)] = 0.01

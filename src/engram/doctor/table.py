@@ -293,7 +293,7 @@ CHECKS: tuple[Check, ...] = (
     Check(
         "bad_pairs", _WARNING, checks.bad_pairs, 0, "pairs",
         "pairs cannot be used",
-        "mend or remove their images, or leave the pairs out with --skip-bad",
+        "mend or remove their images, or leave the pairs out with --set drive.skip_bad=true",
         example=lambda seen: seen.bad[0],
     ),
     Check(
@@ -322,14 +322,14 @@ CHECKS: tuple[Check, ...] = (
         "part of the image moves with the camera, such as a bonnet, a gripper or dirt; it is left "
         "out",
         "clean the lens, or leave that part out from the first frame on: engram doctor DRIVE "
-        "--pictures DIR draws it and writes DIR/mask.png for --mask",
+        "--pictures DIR draws it and writes DIR/mask.png for drive.mask",
     ),
     Check(
         "stands_still_in_part", _WARNING, checks.doubted, "doubted", "of the frames",
         "part of the image stands still while the rest moves, and it is open which of them is the "
         "world; no position is taken from such frames",
-        "give --motion with wheels or a gyroscope, or --mask with what is fixed to the camera in "
-        "black",
+        "give --motion with wheels or a gyroscope, or drive.mask with what is fixed to the camera "
+        "in black",
     ),
     Check(
         "overexposed", _WARNING, checks.saturated, "spoilt_frames", "of the frames",
@@ -386,14 +386,14 @@ CHECKS: tuple[Check, ...] = (
     Check(
         "clock_unknown", _WARNING, checks.hours_needed, 0, "of 2 unknown",
         "missions by hour need a UTC clock and a zone or longitude",
-        "give --recorded-at, and --zone or --longitude",
+        "give drive.recorded_at, and drive.zone",
         checks.hour_given_by,
         explains=("clock_unstated",),
     ),
     Check(
         "clock_unstated", _NOTE, checks.hours_unknown, 0, "of 2 unknown",
         "the hour of the drive is unknown",
-        "for downloads by hour give --recorded-at, and --zone or --longitude",
+        "for downloads by hour give drive.recorded_at, and drive.zone",
         lambda seen: f"for downloads by hour {checks.hour_given_by(seen)}",
     ),
 )  # fmt: skip

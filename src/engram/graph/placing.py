@@ -23,7 +23,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from engram.config import PUBLIC, check_bounds
+from engram.config import check_bounds
 from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph, grouped, labels_of
 from engram.graph.model import Edge, EdgeKind, NodeId
@@ -441,7 +441,6 @@ class PlacingConfig:
     level_rad: Annotated[
         float,
         Meta(ge=0, description="standard deviation of the slope of the ground, rad; 0: unknown"),
-        PUBLIC,
     ] = 0.1
     apart_m: Annotated[
         float, Meta(ge=0, description="gap between components that stand side by side, m")

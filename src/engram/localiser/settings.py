@@ -129,7 +129,7 @@ class LocaliserConfig:
     search_radius_m: Annotated[float, PUBLIC] = 8.0
     max_search_radius_m: Annotated[float, PUBLIC] = 30.0
     view_gate_rad: Annotated[float, PUBLIC] = float(np.deg2rad(60.0))
-    own_exclusion_m: Annotated[float, PUBLIC] = 30.0
+    own_exclusion_m: float = 30.0
     lost_after_m: Annotated[float, PUBLIC] = 10.0
     greatest_gap_m: float = 3.0
     followed_gap_m: float = 1.0

@@ -462,7 +462,7 @@ class MapperConfig:
     sure_inliers: Annotated[int, PUBLIC] = 60
     tie_within_m: float = 8.0
     checkpoint_every: Annotated[int, PUBLIC] = 20
-    memory_bytes: Annotated[int, PUBLIC] = 256_000_000
+    memory_bytes: int = 256_000_000
     votes: VoteConfig = field(default_factory=VoteConfig)
     proximity: ProximityConfig = field(default_factory=ProximityConfig)
 

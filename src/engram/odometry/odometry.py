@@ -96,7 +96,7 @@ class OdometryConfig:
     acceleration_m_s2: float = 4.0
     angular_acceleration_rad_s2: float = 5.0
     max_prediction_s: float = 0.25
-    keyframe_flow_px: Annotated[float, PUBLIC] = 10.0
+    keyframe_flow_px: float = 10.0
     keyframe_share: float = 0.3
 
     def __post_init__(self) -> None:

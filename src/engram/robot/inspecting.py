@@ -217,8 +217,8 @@ def export_map(
     named = form or _SUFFIXES.get(out.suffix.lower(), "")
     if named not in FORMS:
         raise InputError(
-            f"{out}: {form or out.suffix!r} is not a known format; choose --format from "
-            f"{', '.join(FORMS)}"
+            f"{out}: {form or out.suffix!r} is not a known format; its name must end in "
+            f"{', '.join(_SUFFIXES)}"
         )
     with Map.open(path, at=at) as store:
         place = {one: number for number, one in enumerate(store.sessions)}

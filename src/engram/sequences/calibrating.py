@@ -164,6 +164,6 @@ def check_no_view(options: OpenOptions, cameras: Cameras) -> None:
     """Refuses a chosen field of view for images that come rectified."""
     if options.field_of_view_deg is not None and cameras.rectification is None:
         raise CalibrationError(
-            "the images are rectified already: --field-of-view is for raw images "
+            "the images are rectified already: drive.field_of_view_deg is for raw images "
             "and their calibration"
         )

@@ -182,7 +182,7 @@ class ImageSequence:
         for index in {0, len(self) // 2, len(self) - 1} - {bad}:
             with suppress(SequenceError):
                 self.read(index)
-                return "leave it out with --skip-bad"
+                return "leave it out with --set drive.skip_bad=true"
         return "the pairs in the middle and at the end cannot be read either"
 
     def bits(self) -> int | None:

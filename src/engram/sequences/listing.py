@@ -1,7 +1,7 @@
 """Listing of a layout on disk: numbered places, each a pair of files or a fault.
 
 Each reader turns its layout into a listing. Faults are only noted there, so `--frames` and
-`--skip-bad` mean the same for every layout. Stamps are read from decimal seconds, dates or
+`skip_bad` mean the same for every layout. Stamps are read from decimal seconds, dates or
 nanoseconds, without rounding, as whole nanoseconds.
 """
 
@@ -155,7 +155,7 @@ class StampedFile:
 
 
 class WrongStamp(str):
-    """The fault of a place that is left out for its stamp, whatever `--skip-bad` says."""
+    """The fault of a place that is left out for its stamp, whatever `skip_bad` says."""
 
     fault: StampFault
 
@@ -353,12 +353,12 @@ def usable_pairs(
     pairs = [place for place in chosen if isinstance(place, PairFiles)]
     if bad and pairs and not skip_bad:
         more = f" (and {len(bad) - 1} more such faults)" if len(bad) > 1 else ""
-        raise SequenceError(f"{bad[0]}{more}; leave them out with --skip-bad")
+        raise SequenceError(f"{bad[0]}{more}; leave them out with --set drive.skip_bad=true")
     if not pairs:
         if places and not chosen:
             raise SequenceError(
                 f"{where}: none of its {counted(len(places), 'pair')} is chosen, 0 to "
-                f"{len(places) - 1}; change --frames, --from or --to"
+                f"{len(places) - 1}; change --frames, drive.from_ or drive.to"
             )
         why = f"; first fault: {reasons[0]}" if reasons else ""
         raise SequenceError(

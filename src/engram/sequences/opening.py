@@ -6,17 +6,17 @@ Other packages add layouts by entry points of the group `engram.readers` that na
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from shlex import quote
 from types import MappingProxyType
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+from engram.drive_options import DriveOptions
 from engram.errors import ConfigError, SequenceError
 from engram.files import check_there
-from engram.keywords import keywords
+from engram.keywords import keywords_of
 from engram.plugins import PluginGroup, check_is
 from engram.sequences.bags.bag_sequence import BagSequence, open_bag
 from engram.sequences.bags.containers import is_bag
@@ -40,17 +40,7 @@ from engram.sequences.layouts import (
     is_robotcar,
     is_tumvi,
 )
-from engram.sequences.sequence import (
-    PAIR_TOLERANCE_NS,
-    Channel,
-    FrameRange,
-    Moment,
-    OpenOptions,
-    Rig,
-    TimeRange,
-    parse_choice,
-    parse_time,
-)
+from engram.sequences.sequence import OpenOptions, Rig
 
 Drive: TypeAlias = ImageSequence | BagSequence | FrameLog
 
@@ -149,29 +139,8 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
 )
 
 
-@keywords(start="recorded_at")
-def open_drive(
-    path: str | Path,
-    *,
-    format: str | None = None,  # noqa: A002, the word of the command line
-    rig: Rig | str = Rig.GREY,
-    channel: Channel | str = Channel.GREY,
-    frames: FrameRange | str | None = None,
-    from_: Moment | None = None,
-    to: Moment | None = None,
-    skip_bad: bool = False,
-    pair_tolerance_ns: int = PAIR_TOLERANCE_NS,
-    robot: str | None = None,
-    recorded_at: str | datetime | int | None = None,
-    longitude_deg: float | None = None,
-    zone: str | None = None,
-    calibration: str | Path | None = None,
-    field_of_view_deg: float | None = None,
-    mask: str | Path | None = None,
-    left: str | None = None,
-    right: str | None = None,
-    motion: Sequence[str | Path] = (),
-) -> Drive:
+@keywords_of(DriveOptions, start="recorded_at")
+def open_drive(path: str | Path, **given: Any) -> Drive:
     """Opens a drive of any known layout. Folders are checked for all images; none is decoded.
 
     Image layouts give an `ImageSequence`, bags a `BagSequence` (both are a `StereoSequence`), frame
@@ -179,28 +148,7 @@ def open_drive(
 
     Args:
         path: folder or file of the drive: stereo images, a ROS bag, or a frame log.
-        format: one of `layout_names()`; None recognises the layout by its files.
-        rig: "grey" or "colour" (or "color"), if the robot has both (KITTI).
-        channel: "grey", or one channel of colour images: "red", "green", "blue".
-        frames: which frames are used, as text START:STOP:STEP or `FrameRange`, counted from 0;
-            None for all.
-        from_, to: stretch of the drive that is used, both ends included: seconds from its first
-            frame (12.5), or a time as in `recorded_at`; None for the drive's own ends.
-        skip_bad: leave out bad pairs and count them (`skipped`), instead of failing.
-        pair_tolerance_ns: largest difference of stamps within a pair, ns, for layouts that pair
-            by stamp.
-        robot: name of the robot; None for that of the source.
-        recorded_at: time of the drive's first frame, for a drive whose clock is relative or
-            unknown: ISO 8601 (UTC unless it has an offset), a `datetime`, or ns since 1970 (int).
-        longitude_deg: longitude of the drive, degrees east; None for that of the source.
-        zone: IANA time zone of the drive, "Europe/London"; None for that of the source.
-        calibration: file of the pair's calibration, see `engram.calibration`; None for the drive's
-            own.
-        field_of_view_deg: horizontal field of view of the rectified images, degrees, 10 to 170;
-            None for the largest.
-        mask: image that is black where the robot sees itself, of the size of the drive's images.
-        left, right: topics of a bag's images; None finds them by their names.
-        motion: topics of a bag, or files, with odometry or a gyroscope's rates.
+        **given: the fields of `DriveOptions`, which describes them.
 
     Raises:
         SequenceError: the path does not exist, has no known layout, or its images or stamps
@@ -211,34 +159,13 @@ def open_drive(
         MissingExtraError: it is a bag, and the extra `bags` is not installed.
         IncompatibleError: another package adds a layout, and it cannot be used.
     """
-    options = OpenOptions(
-        rig=parse_choice(Rig, rig),
-        channel=parse_choice(Channel, channel),
-        frames=FrameRange.parse(frames) if isinstance(frames, str) else frames or FrameRange(),
-        times=TimeRange.parse(from_, to),
-        skip_bad=skip_bad,
-        pair_tolerance_ns=pair_tolerance_ns,
-        robot=robot,
-        recorded_at_ns=parse_time("recorded_at", recorded_at),
-        longitude_deg=longitude_deg,
-        zone=zone,
-        calibration=None if calibration is None else Path(calibration),
-        field_of_view_deg=field_of_view_deg,
-        mask=None if mask is None else Path(mask),
-        left=left,
-        right=right,
-        motion=tuple(map(str, motion)),
-    )
-    return open_with(Path(path), options, format)
+    return open_with(Path(path), DriveOptions(**given))
 
 
-def open_with(path: Path, options: OpenOptions, name: str | None = None) -> Drive:
-    """Opens a drive by checked options; see `open_drive` for the errors.
-
-    Args:
-        name: one of `layout_names()`; None recognises the layout by its files.
-    """
-    name = recognise(path) if name is None else name
+def open_with(path: Path, given: DriveOptions) -> Drive:
+    """As `open_drive`, with all keywords in one."""
+    options = OpenOptions.of(given)
+    name = recognise(path) if given.format is None else given.format
     layout = layout_named(name)
     if options.rig not in layout.rigs:
         raise ConfigError(
@@ -283,7 +210,7 @@ def recognise(path: Path) -> str:
         return layouts[0]
     if layouts:
         raise SequenceError(
-            f"{path}: could be {' or '.join(layouts)}: name the layout with --format"
+            f"{path}: could be {' or '.join(layouts)}: name the layout with --set drive.format=NAME"
         )
     inside = drives_inside(path)
     if inside:

@@ -9,18 +9,22 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Protocol, TypeAlias, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 from msgspec import Meta
 
 from engram.config import check_bounds
+from engram.drive_options import PAIR_TOLERANCE_NS, DriveOptions
 from engram.errors import ConfigError, InputError
 from engram.frontend.frame import Frame, StereoPair
 from engram.geometry.cameras import StereoCamera
 from engram.graph.clock import check_longitude, check_zone
 from engram.graph.model import LONGEST_NAME, Clock, Session, session_id
 from engram.odometry.step import OdometryStep
+
+if TYPE_CHECKING:
+    from engram.drive_options import Moment
 
 # Robot name of a drive if neither source nor caller gives one.
 UNNAMED_ROBOT = "robot"
@@ -144,10 +148,6 @@ def session_of(
 T = TypeVar("T")
 E = TypeVar("E", bound=StrEnum)
 
-Moment: TypeAlias = str | float | int | datetime
-"""A moment of a drive: seconds from its first frame (float, or such text), or a time: ISO 8601,
-`datetime`, or ns since 1970 (int)."""
-
 _PART = re.compile(r"[0-9]{1,9}")
 _SECONDS = re.compile(r"[0-9]{1,9}(\.[0-9]{0,9})?")
 _MICROSECOND = timedelta(microseconds=1)
@@ -244,12 +244,12 @@ class TimeRange:
     def __post_init__(self) -> None:
         start, stop = self.start, self.stop
         if start is not None and stop is not None and type(start) is type(stop) and stop < start:
-            raise ConfigError(f"--from {start} is after --to {stop}: no frame lies between")
+            raise ConfigError(f"from_ {start} is after to {stop}: no frame lies between")
 
     @staticmethod
     def parse(start: Moment | None, stop: Moment | None) -> TimeRange:
         """Reads seconds such as 12.5, or times such as 2026-03-01T09:30:00Z (UTC)."""
-        return TimeRange(_moment("--from", start), _moment("--to", stop))
+        return TimeRange(_moment("from_", start), _moment("to", stop))
 
     @property
     def is_all(self) -> bool:
@@ -287,25 +287,12 @@ def _moment(option: str, given: Moment | None) -> float | int | None:
         ) from None
 
 
-# Software-triggered pairs stay below it, and it is half of the frame interval at 100 Hz.
-PAIR_TOLERANCE_NS = 5_000_000
-
-
 @dataclass(frozen=True, slots=True)
 class OpenOptions:
-    """How to open a drive.
+    """How to open a drive, read from `DriveOptions`.
 
-    Attributes:
-        skip_bad: leave out bad pairs and count them, instead of failing.
-        pair_tolerance_ns: largest difference of stamps within a pair, ns, for layouts that pair by
-            stamp.
-        recorded_at_ns: time of the drive's first frame, ns since 1970 UTC, for a drive whose clock
-            is not UTC.
-        longitude_deg, zone: where the drive was; None for the source's value.
-        field_of_view_deg: horizontal field of view of rectified images; None for the largest.
-        mask: image that is black where the robot sees itself; None for none.
-        left, right: topics of a bag's images; None finds them by their names.
-        motion: topics or files of odometry and gyroscope.
+    Raises:
+        ConfigError: the longitude is outside ±180°, the zone is unknown, the tolerance negative.
     """
 
     rig: Rig = Rig.GREY
@@ -333,6 +320,32 @@ class OpenOptions:
         check_longitude(self.longitude_deg)
         check_zone(self.zone)
         check_bounds(self)
+
+    @classmethod
+    def of(cls, given: DriveOptions) -> Self:
+        """The options as people wrote them.
+
+        Raises:
+            ConfigError: one of them is malformed or out of range.
+        """
+        return cls(
+            rig=parse_choice(Rig, given.rig),
+            channel=parse_choice(Channel, given.channel),
+            frames=FrameRange() if given.frames is None else FrameRange.parse(given.frames),
+            times=TimeRange.parse(given.from_, given.to),
+            skip_bad=given.skip_bad,
+            pair_tolerance_ns=given.pair_tolerance_ns,
+            robot=given.robot,
+            recorded_at_ns=parse_time("recorded_at", given.recorded_at),
+            longitude_deg=given.longitude_deg,
+            zone=given.zone,
+            calibration=None if given.calibration is None else Path(given.calibration),
+            field_of_view_deg=given.field_of_view_deg,
+            mask=None if given.mask is None else Path(given.mask),
+            left=given.left,
+            right=given.right,
+            motion=tuple(map(str, given.motion)),
+        )
 
 
 def parse_choice(kind: type[E], text: str) -> E:

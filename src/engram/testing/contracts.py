@@ -554,7 +554,7 @@ class _Trial:
         if self._image_files(self._drive):
             yield _checked_drive("a damaged image is an error that names the file", self._damaged)
             yield _checked_drive(
-                "--skip-bad leaves out a damaged pair and counts it", self._skipped
+                "--set drive.skip_bad=true leaves out a damaged pair and counts it", self._skipped
             )
             yield _checked_drive("a missing image costs its own pair", self._missing)
 

@@ -26,19 +26,12 @@ def relocalise(
             help="How a frame is found: fabmap, bag-of-words or exhaustive.",
         ),
     ] = "fabmap",
-    drive: options.Drive,
-    lanes: Annotated[
-        int | None,
-        typer.Option(
-            "--lanes",
-            metavar="N",
-            min=1,
-            help="Match attempts in parallel (Np) [default: as in the settings].",
-        ),
-    ] = None,
-    rounds: options.Rounds = 32,
+    drive: options.Seen,
+    rounds: Annotated[
+        int, typer.Option("--rounds", metavar="N", min=1, help="Rounds of attempts (Nr).")
+    ] = 32,
     at: options.At = None,
-    config: options.Settings = None,
+    settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
     """Find each frame of a drive by itself.
@@ -51,13 +44,12 @@ def relocalise(
       engram lab relocalise town.engram drives/tuesday --frames 0:1000:10 --json
     """
     from engram.cli.screen import Bars
-    from engram.cli.settings import read_settings
     from engram.localiser.localisation import Budget
     from engram.robot.settings import RobotOptions
     from engram_lab.relocalising import relocalise_drive, summarise_cold_starts
 
-    sequence, given = drive.open(path), read_settings(config)
-    lanes = lanes or given.drive.lanes
+    sequence, given = drive.open(path, settings)
+    lanes = given.drive.lanes
     robot = RobotOptions(lanes=lanes, threads=given.drive.threads)
     starts = relocalise_drive(
         map_path,
@@ -168,7 +160,7 @@ def try_(
       engram lab try fleet.engram monday.framelog tuesday.framelog --select budget --budget 25%
     """
     from engram.cli.screen import Bars
-    from engram.fleet.download.mission import budget_from_text, hour_from_text
+    from engram.fleet.download.mission import DownloadOptions, budget_from_text, hour_from_text
     from engram.robot.localisers import session_of_drive
     from engram.robot.settings import RobotOptions
     from engram.sequences.opening import open_drive
@@ -184,7 +176,8 @@ def try_(
     given = settings.read()
     if window is not None:
         given = replace(given, download=replace(given.download, window_min=window))
-    asked = given.download.options(
+    asked = DownloadOptions.of(
+        given.download,
         policy,
         strict="tod" in policy or policy == "paths",  # an hour without data is a row of its own
         depart_h=hour_from_text(start, "start"),
@@ -198,7 +191,7 @@ def try_(
     left_out: list[LeftOut] = []
     trials = try_downloads(
         centre,
-        {asked.select: asked, "copy": given.download.options("copy")},
+        {asked.select: asked, "copy": DownloadOptions.of(given.download, "copy")},
         [partial(open_drive, drive) for drive in drives],
         given.of_robot(),
         RobotOptions(**effort.over(given)),

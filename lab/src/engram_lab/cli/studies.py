@@ -60,16 +60,25 @@ class _Study:
         str, typer.Option("--size", metavar="SIZE", help="Of campaigns: standard or full.")
     ] = "standard"
     folds: Annotated[
-        int, typer.Option("--folds", metavar="N", min=2, help="Folds of the cross-validation.")
+        int,
+        typer.Option(
+            "--folds", metavar="N", min=2, help="Folds of the cross-validation.", hidden=True
+        ),
     ] = 5
     only_folds: Annotated[
         str | None,
         typer.Option(
-            "--only-folds", metavar="N,N…", help="Run these folds now, from 0 [default: all]."
+            "--only-folds",
+            metavar="N,N…",
+            help="Run these folds now, from 0 [default: all].",
+            hidden=True,
         ),
     ] = None
     seed: Annotated[
-        int, typer.Option("--seed", metavar="N", min=0, help="Seed of shuffling and bootstrap.")
+        int,
+        typer.Option(
+            "--seed", metavar="N", min=0, help="Seed of shuffling and bootstrap.", hidden=True
+        ),
     ] = 0
     workers: Annotated[
         int, typer.Option("--workers", metavar="N", min=1, help="Processes on this machine.")
@@ -83,12 +92,16 @@ class _Study:
             "--campaigns",
             metavar="DIR",
             help="Folder of the campaigns [default: the user's cache].",
+            hidden=True,
         ),
     ] = None
     work: Annotated[
         Path | None,
         typer.Option(
-            "--work", metavar="DIR", help="Folder of maps and results [default: the user's cache]."
+            "--work",
+            metavar="DIR",
+            help="Folder of maps and results [default: the user's cache].",
+            hidden=True,
         ),
     ] = None
     config: options.Settings = None
@@ -173,6 +186,7 @@ def ranking(
             "--lanes",
             metavar="N,N…",
             help="Values of Np; 0: all candidates [default: 1,2,3,4,6,8,12,16,0].",
+            hidden=True,
         ),
     ] = None,
     rounds: Annotated[
@@ -181,6 +195,7 @@ def ranking(
             "--rounds",
             metavar="N,N…",
             help="Values of Nr; the first for all policies [default: 1,2].",
+            hidden=True,
         ),
     ] = None,
     map_sizes: Annotated[
@@ -196,14 +211,18 @@ def ranking(
             metavar="N",
             min=0,
             help="Folds that are also run in real time, and timed.",
+            hidden=True,
         ),
     ] = 1,
     relocaliser: Annotated[
-        str, typer.Option("--relocaliser", metavar="NAME", help="How lost robots are found.")
+        str,
+        typer.Option(
+            "--relocaliser", metavar="NAME", help="How lost robots are found.", hidden=True
+        ),
     ] = "none",
     redo: Annotated[
         str | None,
-        typer.Option("--redo", metavar="NAME,NAME…", help="Run these policies again."),
+        typer.Option("--redo", metavar="NAME,NAME…", help="Run these policies again.", hidden=True),
     ] = None,
     out: Annotated[
         Path, typer.Option("--out", metavar="DIR", help="Folder for tables and figures.")
@@ -279,6 +298,7 @@ def fleet(
             "--groups",
             metavar="N,N…",
             help="Groups of the parallel build; all but the first on one fold.",
+            hidden=True,
         ),
     ] = "4,2,8",
     tried: Annotated[
@@ -288,6 +308,7 @@ def fleet(
             min=1,
             metavar="N",
             help="Held-out drives per fold for downloads [default: all].",
+            hidden=True,
         ),
     ] = None,
     relocaliser: Annotated[
@@ -296,6 +317,7 @@ def fleet(
             "--relocaliser",
             metavar="NAME",
             help="How lost robots are found; merges have merge.relocaliser.",
+            hidden=True,
         ),
     ] = "fabmap",
     out: Annotated[
@@ -388,13 +410,18 @@ def faults(
         str | None, typer.Option("--towns", metavar="N,N…", help="Seeds of a question's towns.")
     ] = None,
     campaign: Annotated[
-        str, typer.Option("--campaign", metavar="NAME", help="Of a question: NAME or NAME@SEED.")
+        str,
+        typer.Option(
+            "--campaign", metavar="NAME", help="Of a question: NAME or NAME@SEED.", hidden=True
+        ),
     ] = "",
     mapped: Annotated[
-        str | None, typer.Option("--mapped", metavar="N,N…", help="Drives that are mapped.")
+        str | None,
+        typer.Option("--mapped", metavar="N,N…", help="Drives that are mapped.", hidden=True),
     ] = None,
     live: Annotated[
-        str | None, typer.Option("--live", metavar="N,N…", help="Drives that are localised.")
+        str | None,
+        typer.Option("--live", metavar="N,N…", help="Drives that are localised.", hidden=True),
     ] = None,
     features: Annotated[
         str, typer.Option("--features", metavar="KIND", help="Of a question: brief or net.")
@@ -412,6 +439,7 @@ def faults(
             "--work",
             metavar="FILE",
             help="File of the trials, folder of questions [default: in the user's cache].",
+            hidden=True,
         ),
     ] = None,
     out: Annotated[

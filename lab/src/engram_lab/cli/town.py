@@ -111,14 +111,21 @@ def simulate(
     ] = 2,
     period: Annotated[
         float,
-        typer.Option("--period", metavar="M", help="estate: distance after which fronts repeat."),
+        typer.Option(
+            "--period", metavar="M", help="estate: distance after which fronts repeat.", hidden=True
+        ),
     ] = 37.5,
     equal: Annotated[
-        float, typer.Option("--equal", metavar="SHARE", help="estate: share of equal fronts.")
+        float,
+        typer.Option(
+            "--equal", metavar="SHARE", help="estate: share of equal fronts.", hidden=True
+        ),
     ] = 1.0,
     unique: Annotated[
         str,
-        typer.Option("--unique", metavar="WHAT,…", help="estate: what differs between streets."),
+        typer.Option(
+            "--unique", metavar="WHAT,…", help="estate: what differs between streets.", hidden=True
+        ),
     ] = "road,things,cars",
     config: options.Settings = None,
     as_json: options.Json = False,

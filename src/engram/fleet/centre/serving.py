@@ -207,7 +207,8 @@ def back_up(centre: Centre, target: Path) -> dict[str, int]:
     names = centre.map_names()
     if not names:
         raise InputError(
-            f"{centre.folder} has no maps in its tables; if PostgreSQL has them, give --database"
+            f"{centre.folder} has no maps in its tables; if PostgreSQL has them, set "
+            "ENGRAM_DATABASE"
         )
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

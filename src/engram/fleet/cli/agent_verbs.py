@@ -24,21 +24,19 @@ agent_group = typer.Typer(
 )
 
 Folder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="The agent's folder.")]
-Config: TypeAlias = Annotated[
-    Path | None,
-    typer.Option("--config", metavar="FILE", help="The agent's settings in TOML: link, download."),
-]
 _LOOK_S = 0.5
 
 
-def _open(folder: Path, config: Path | None = None) -> Agent:
+def _open(folder: Path) -> Agent:
+    """The agent of a folder, with the settings in its `agent.toml`."""
     from engram.config import load_toml
     from engram.errors import ConfigError
     from engram.fleet.agent.agent import Agent
     from engram.fleet.agent.state import AgentSettings
     from engram.untrusted import read_text
 
-    text = "" if config is None else read_text(config, ConfigError)
+    config = folder / "agent.toml"
+    text = read_text(config, ConfigError) if config.exists() else ""
     settings = load_toml(text, AgentSettings)
     return Agent(folder, settings, wait=threading.Event().wait)
 
@@ -65,8 +63,10 @@ def enrol(
 
 
 @agent_group.command()
-def run(folder: Folder, *, config: Config = None) -> None:
+def run(folder: Folder) -> None:
     """Send and fetch maps until stopped.
+
+    Settings of link and download are in FOLDER/agent.toml.
 
     Sends what is queued and fetches the version that the centre wants on this robot. Reports each
     event in a line on stderr.
@@ -74,12 +74,11 @@ def run(folder: Folder, *, config: Config = None) -> None:
     \b
     Examples:
       engram agent run r1
-      engram agent run r1 --config agent.toml
     """
     from engram.logs import logging_to_stderr
 
     waiting = threading.Event()
-    with logging_to_stderr(), _open(folder, config) as agent:
+    with logging_to_stderr(), _open(folder) as agent:
         agent.introduce()
         while True:
             waiting.wait(agent.step())
@@ -95,7 +94,6 @@ def sync(
             "--wait", metavar="S", min=0, help="Seconds to wait for what the centre is making."
         ),
     ] = 0.0,
-    config: Config = None,
     as_json: options.Json = False,
 ) -> None:
     """Send and fetch maps once, as far as the link allows.
@@ -108,7 +106,7 @@ def sync(
       engram agent sync r1 --wait 60 --json
     """
     waiting = threading.Event()
-    with _open(folder, config) as agent:
+    with _open(folder) as agent:
         until_s = time.monotonic() + wait_s
         while (pause_s := agent.step()) == 0 or (agent.waits and time.monotonic() < until_s):
             waiting.wait(min(pause_s, _LOOK_S))
@@ -119,7 +117,7 @@ def sync(
 
 
 @agent_group.command("hand-in")
-def hand_in(folder: Folder, *, config: Config = None) -> None:
+def hand_in(folder: Folder) -> None:
     """Queue what the robot has mapped.
 
     Needs no link: the next sync or run sends it.
@@ -128,7 +126,7 @@ def hand_in(folder: Folder, *, config: Config = None) -> None:
     Examples:
       engram agent hand-in r1
     """
-    with _open(folder, config) as agent:
+    with _open(folder) as agent:
         key = agent.hand_in()
     typer.echo("nothing new to hand in" if key is None else f"queued {key[:12]}")
 
@@ -175,7 +173,6 @@ def drove(
     driven_m: Annotated[
         float, typer.Option("--metres", metavar="M", min=0, help="Distance driven.")
     ],
-    config: Config = None,
 ) -> None:
     """Report how well the map localised a drive.
 
@@ -185,7 +182,7 @@ def drove(
     Examples:
       engram agent drove r1 --share 0.97 --metres 1200
     """
-    with _open(folder, config) as agent:
+    with _open(folder) as agent:
         typer.echo("fell back" if agent.drove(share, driven_m) else "noted")
 
 

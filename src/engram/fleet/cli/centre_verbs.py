@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,21 +24,19 @@ Folder: TypeAlias = Annotated[Path, typer.Argument(metavar="FOLDER", help="The c
 MapName: TypeAlias = Annotated[
     str, typer.Option("--map", metavar="NAME", help="Which of the centre's maps.")
 ]
-Database: TypeAlias = Annotated[
-    str | None,
-    typer.Option(
-        "--database", metavar="URL", help="postgresql+psycopg://… [default: SQLite in FOLDER]."
-    ),
-]
-Objects: TypeAlias = Annotated[
-    str | None,
-    typer.Option("--objects", metavar="URL", help="s3://bucket/prefix [default: files in FOLDER]."),
-]
+# In the environment: postgresql+psycopg://… for the tables, s3://bucket/prefix for the parts.
+DATABASE = "ENGRAM_DATABASE"
+OBJECTS = "ENGRAM_OBJECTS"
 BY = "shell"
 NONE = "none"
 
 
-def open_centre(folder: Path, database: str | None = None, objects: str | None = None) -> Centre:
+def stores() -> tuple[str | None, str | None]:
+    """Where tables and parts are: of the environment; None for files in the centre's folder."""
+    return os.environ.get(DATABASE), os.environ.get(OBJECTS)
+
+
+def open_centre(folder: Path) -> Centre:
     """A centre that is there.
 
     Raises:
@@ -45,6 +44,7 @@ def open_centre(folder: Path, database: str | None = None, objects: str | None =
     """
     from engram.fleet.centre.service import Centre
 
+    database, objects = stores()
     if not (folder / ("maps" if database else "centre.sqlite")).exists():
         raise InputError(f"{folder}: there is no centre; start one: engram centre serve {folder}")
     return Centre(folder, database, objects)
@@ -79,7 +79,6 @@ def map_(
         ),
     ] = None,
     settings: options.SettingsGiven,
-    database: Database = None,
 ) -> None:
     """Make a map, or change how its hand-ins are merged.
 
@@ -102,7 +101,7 @@ def map_(
         changes["moves"] = _movable(moves)
     if quiet is not None:
         changes["quiet"] = _hours(quiet)
-    with Centre(folder, database) as centre:
+    with Centre(folder, *stores()) as centre:
         centre.add_map(name, BY)
         policy = replace(centre.policy(name), **changes)
         centre.set_policy(name, policy, BY)
@@ -154,7 +153,6 @@ def dream(
         str | None, typer.Option("--cancel", metavar="DREAM", help="End this one.")
     ] = None,
     as_json: options.Json = False,
-    database: Database = None,
 ) -> None:
     """Ask for a dream, for whenever no robot waits.
 
@@ -168,7 +166,7 @@ def dream(
     from engram.fleet.centre import dreams, jobs
     from engram.fleet.centre.tables import Dream, values_of
 
-    with open_centre(folder, database) as centre:
+    with open_centre(folder) as centre:
         if cancel is None:
             row = dreams.ask(centre, map_name, BY)
         else:
@@ -185,7 +183,6 @@ def jobs(
         typer.Option("--cancel", metavar="JOB", help="Cancel this hand-in: its id as listed."),
     ] = None,
     as_json: options.Json = False,
-    database: Database = None,
 ) -> None:
     """List hand-ins and dreams and their state, newest last.
 
@@ -198,7 +195,7 @@ def jobs(
     from engram.fleet.centre import jobs as any_job
     from engram.fleet.centre.tables import HandIn, values_of
 
-    with open_centre(folder, database) as centre:
+    with open_centre(folder) as centre:
         centre.map_row(map_name)
         if cancel is not None:
             any_job.cancel(centre, any_job.get(centre, HandIn, cancel), BY)
@@ -241,15 +238,15 @@ def serve(
         bool,
         typer.Option("--insecure", help="Listen on other addresses than 127.0.0.1 without TLS."),
     ] = False,
-    database: Database = None,
-    objects: Objects = None,
     worker: Annotated[
         bool, typer.Option("--worker/--no-worker", help="Run a worker along with the service.")
     ] = True,
 ) -> None:
     """Serve maps to robots and people.
 
-    FOLDER holds everything; no other server is needed. The first start makes the map.
+    FOLDER holds everything; no other server is needed. The first start makes the map. In the
+    environment, ENGRAM_DATABASE (postgresql+psycopg://…) and ENGRAM_OBJECTS (s3://bucket/prefix)
+    keep tables and parts elsewhere, for all verbs of the centre.
 
     \b
     Examples:
@@ -261,7 +258,7 @@ def serve(
     from engram.logs import logging_to_stderr
 
     listening = serving.Listening(host, port, certificate, key, insecure=insecure)
-    with logging_to_stderr(), Centre(folder, database, objects) as centre:
+    with logging_to_stderr(), Centre(folder, *stores()) as centre:
         centre.add_map(map_name, BY)
         serving.serve(centre, listening, worker=worker)
 
@@ -269,8 +266,6 @@ def serve(
 def worker(
     folder: Folder,
     *,
-    database: Database = None,
-    objects: Objects = None,
     scheduler: Annotated[
         str | None,
         typer.Option("--scheduler", metavar="ADDRESS", help="Dream on a Dask cluster."),
@@ -286,8 +281,8 @@ def worker(
     """
     from engram.fleet.centre.serving import run_worker
 
-    open_centre(folder, database, objects).close()
-    run_worker(folder, database, objects, scheduler)
+    open_centre(folder).close()
+    run_worker(folder, *stores(), scheduler)
 
 
 def code(
@@ -300,7 +295,6 @@ def code(
             "--follows", metavar="REF", help="Which version the robot follows: head or a name."
         ),
     ] = "head",
-    database: Database = None,
 ) -> None:
     """Print a code with which one robot enrols.
 
@@ -311,7 +305,7 @@ def code(
     """
     from engram.fleet.centre.access import new_code
 
-    with open_centre(folder, database) as centre:
+    with open_centre(folder) as centre:
         print(new_code(centre, map_name, follows, BY))
 
 
@@ -325,7 +319,6 @@ def token(
     map_name: Annotated[
         str, typer.Option("--map", metavar="NAME", help="Which map; * for all.")
     ] = "*",
-    database: Database = None,
 ) -> None:
     """Print a token for a person.
 
@@ -341,14 +334,14 @@ def token(
     roles = [str(one) for one in Role if one is not Role.ROBOT]
     if role not in {*roles, NONE}:
         raise ConfigError(f"--role {role!r} is unknown; known: {', '.join(roles)}, {NONE}")
-    with open_centre(folder, database) as centre:
+    with open_centre(folder) as centre:
         if role == NONE:
             typer.echo(f"access of {name} is revoked: {', '.join(revoke_access(centre, name, BY))}")
         else:
             print(add_person(centre, name, map_name, Role(role)))
 
 
-def sweep(folder: Folder, *, database: Database = None, objects: Objects = None) -> None:
+def sweep(folder: Folder) -> None:
     """Remove parts that nothing needs any more.
 
     Parts that no hand-in and no download refers to are marked, and deleted by the next sweep.
@@ -360,7 +353,7 @@ def sweep(folder: Folder, *, database: Database = None, objects: Objects = None)
     """
     from engram.fleet.centre.worker import sweep as run
 
-    with open_centre(folder, database, objects) as centre:
+    with open_centre(folder) as centre:
         for name in centre.map_names():
             typer.echo(f"{name}: {run(centre, name)} bytes removed")
 
@@ -370,9 +363,6 @@ def backup(
     target: Annotated[
         Path, typer.Argument(metavar="TARGET", help="A new folder.", parser=output_folder)
     ],
-    *,
-    database: Database = None,
-    objects: Objects = None,
 ) -> None:
     """Copy a centre while it runs.
 
@@ -385,7 +375,7 @@ def backup(
     """
     from engram.fleet.centre.serving import back_up
 
-    with open_centre(folder, database, objects) as centre:
+    with open_centre(folder) as centre:
         for name, revision in back_up(centre, target).items():
             typer.echo(f"{name}: revision {revision} copied")
 

@@ -174,6 +174,7 @@ def download(
             "--date",
             metavar="DAY",
             help="Day of the mission: 2026-11-17 [default: the newest drive's].",
+            hidden=True,
         ),
     ] = None,
     budget: Annotated[
@@ -192,16 +193,11 @@ def download(
         str | None,
         typer.Option("--route", metavar="SESSION", help="Only along this session; not for copy."),
     ] = None,
-    thumbnails: Annotated[
-        bool | None,
-        typer.Option(
-            "--thumbnails/--no-thumbnails",
-            help="Include the nodes' small pictures [default: not with budget].",
-        ),
-    ] = None,
     strict: Annotated[
         bool,
-        typer.Option("--strict", help="Refuse an hour without data instead of widening it."),
+        typer.Option(
+            "--strict", help="Refuse an hour without data instead of widening it.", hidden=True
+        ),
     ] = False,
     at: options.At = None,
     settings: options.SettingsGiven,
@@ -224,12 +220,13 @@ def download(
     """
     from engram.cli.screen import Bars
     from engram.fleet.download.downloading import download as send
-    from engram.fleet.download.mission import budget_from_text, hour_from_text
+    from engram.fleet.download.mission import DownloadOptions, budget_from_text, hour_from_text
     from engram.fleet.download.updating import update as take_in
     from engram.monitor import interruptible
 
     budget_bytes, budget_percent = budget_from_text(budget)
-    asked = settings.read().download.options(
+    asked = DownloadOptions.of(
+        settings.read().download,
         select,
         depart_h=hour_from_text(depart, "depart"),
         arrive_h=hour_from_text(arrive, "arrive"),
@@ -239,7 +236,6 @@ def download(
         near=tuple(near or ()),
         route=route,
         strict=strict,
-        thumbnails=thumbnails,
     )
     report: DownloadReport | UpdateReport
     if update and out.exists():
@@ -289,12 +285,6 @@ def build(
         list[Path] | None,
         typer.Option("--validate", metavar="DRIVE", help="Held-out drive for --order; repeatable."),
     ] = None,
-    keep: Annotated[
-        bool, typer.Option("--keep", help="Keep the groups' maps in FLEET.build.")
-    ] = False,
-    geometry: Annotated[
-        bool, typer.Option("--geometry", help="List the wrong edges of the result.")
-    ] = False,
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
@@ -333,17 +323,11 @@ def build(
         scheduler=scheduler,
         judge=_judge(order, validate or [], resolved),
     )
-    report = build_map(centre, drives, resolved.of_robot(), asked, keep=keep, monitor=Bars())
-    looked = None
-    if geometry and not report.interrupted:
-        from engram.repair.repairing import check_geometry
-
-        looked = check_geometry(centre, resolved.repair, monitor=Bars())
+    report = build_map(centre, drives, resolved.of_robot(), asked, monitor=Bars())
     if as_json:
-        told = report.to_dict()
-        print(json.dumps(told if looked is None else {**told, "geometry": looked.to_dict()}))
+        print(json.dumps(report.to_dict()))
     else:
-        typer.echo(report.text() if looked is None else f"{report.text()}\n{looked.text()}")
+        typer.echo(report.text())
     if report.interrupted:
         raise typer.Exit(ExitStatus.INTERRUPTED)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import date
-from typing import Annotated
+from typing import Annotated, Any
 
 from msgspec import Meta
 
-from engram.config import check_bounds
+from engram.config import PUBLIC, check_bounds
 from engram.errors import ConfigError
 
 _CLOCK = re.compile(r"(?P<hour>\d{1,2})(:(?P<minute>\d{2}))?", re.ASCII)
@@ -19,11 +19,55 @@ _UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 _UNITS |= {f"{name}i": 2 ** (10 * power) for power, name in enumerate("kMGT", start=1)}
 
 
-_Minutes = Annotated[float, Meta(ge=0, le=720)]
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DownloadSettings:
+    """How missions are downloaded: the table `download` of a settings file."""
+
+    window_min: Annotated[
+        float,
+        Meta(ge=0, le=720, description="tod: minutes around departure. Source: [G16] §VI-D"),
+        PUBLIC,
+    ] = 180.0
+    epoch_min: Annotated[
+        float, Meta(ge=1, le=1440, description="paths: length of an epoch, minutes"), PUBLIC
+    ] = 60.0
+    best_percent: Annotated[
+        float,
+        Meta(ge=0, le=100, description="paths: share of each epoch's paths. [G16] §VI-D"),
+        PUBLIC,
+    ] = 50.0
+    buffer_min: Annotated[
+        float,
+        Meta(ge=0, le=720, description="paths: minutes added before and after the mission"),
+        PUBLIC,
+    ] = 0.0
+    widen_min: Annotated[
+        float,
+        Meta(gt=0, le=720, description="step by which an hour without data is widened, minutes"),
+    ] = 60.0
+    latitude_deg: (
+        Annotated[
+            float,
+            Meta(ge=-90, le=90, description="degrees north, for the sun; none: estimated"),
+            PUBLIC,
+        ]
+        | None
+    ) = None
+    radius_m: Annotated[
+        float, Meta(ge=0, le=1e6, description="m along the edges around --near and --route"), PUBLIC
+    ] = 20.0
+    thumbnails: Annotated[
+        bool | None,
+        Meta(description="send the nodes' small pictures; none: not with budget"),
+        PUBLIC,
+    ] = None
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
 
 
 @dataclass(frozen=True, slots=True)
-class DownloadOptions:
+class DownloadOptions(DownloadSettings):
     """What to download; stored in the map that is sent.
 
     Attributes:
@@ -31,41 +75,29 @@ class DownloadOptions:
         depart_h, arrive_h: the mission's hours of day; None if not given.
         date: the mission's date, "2026-11-17"; None for that of the fleet map's newest drive. It
             gives the height of the sun at those hours.
-        latitude_deg: where the fleet drives, north positive; None to estimate it from which
-            sessions matched which nodes.
-        window_min: `tod`: how far a node's time of day may be from the mission's start, minutes.
-            180: [G16] §VI-D.
-        epoch_min: `paths`: length Δt of an epoch, minutes. 60: method §7.
-        best_percent: `paths`: share of the paths of each epoch that is sent. 50: [G16] §VI-D.
-        buffer_min: widens the mission at both ends, minutes.
         budget_bytes: `budget`: largest size of the file.
         budget_percent: `budget`: the same, in per cent of a file with all nodes.
         near: `region`, and any selection but `copy` and `route`: beginnings of UUIDs of nodes.
         route: `route`, and any selection but `copy` and `region`: beginning of the UUID of a
             session that drove it.
-        radius_m: of regions and routes, along the edges, metres.
-        widen_min: `tod`, `paths`: step by which an hour without data is widened, minutes.
-        strict: whether an hour without data is refused instead.
-        thumbnails: whether thumbnails are sent; None for all selections but `budget`.
+        strict: whether an hour without data is refused, not widened.
     """
 
     select: str = "copy"
     depart_h: Annotated[float | None, Meta(ge=0, lt=24)] = None
     arrive_h: Annotated[float | None, Meta(ge=0, lt=24)] = None
     date: str | None = None
-    latitude_deg: Annotated[float | None, Meta(ge=-90, le=90)] = None
-    window_min: _Minutes = 180.0
-    epoch_min: Annotated[float, Meta(ge=1, le=1440)] = 60.0
-    best_percent: Annotated[float, Meta(ge=0, le=100)] = 50.0
-    buffer_min: _Minutes = 0.0
     budget_bytes: Annotated[int | None, Meta(gt=0)] = None
     budget_percent: Annotated[float | None, Meta(gt=0, le=100)] = None
     near: tuple[str, ...] = ()
     route: str | None = None
-    radius_m: Annotated[float, Meta(ge=0, le=1e6)] = 20.0
-    widen_min: Annotated[float, Meta(gt=0, le=720)] = 60.0
     strict: bool = False
-    thumbnails: bool | None = None
+
+    @classmethod
+    def of(cls, settings: DownloadSettings, select: str, **mission: Any) -> DownloadOptions:
+        """What to download by these settings."""
+        own = {one.name: getattr(settings, one.name) for one in fields(DownloadSettings)}
+        return cls(select, **{**own, **mission})
 
     def __post_init__(self) -> None:
         check_bounds(self)

@@ -53,8 +53,8 @@ def open_framelog(path: Path, options: OpenOptions) -> FrameLog:
         )
     for option, value in (
         ("--calibration", options.calibration),
-        ("--field-of-view", options.field_of_view_deg),
-        ("--mask", options.mask),
+        ("drive.field_of_view_deg", options.field_of_view_deg),
+        ("drive.mask", options.mask),
     ):
         if value is not None:
             raise ConfigError(f"{path}: a frame log has no images: give {option} when recording it")
@@ -180,7 +180,9 @@ class FrameLog:
                 logged = self._read(number, previous)
             except MapCorruptError as error:
                 if not self._skip_bad:
-                    raise MapCorruptError(f"{error}; leave it out with --skip-bad") from error
+                    raise MapCorruptError(
+                        f"{error}; leave it out with --set drive.skip_bad=true"
+                    ) from error
                 self._skipped_reasons.append(str(error))
                 continue
             if logged.odometry.status is not OdometryStatus.UNUSABLE_FRAME:

@@ -141,7 +141,7 @@ class Clip:
 class ClipDrive:
     """Frames of a clip as a `StereoSequence`.
 
-    As a reader under ``--skip-bad`` it leaves out frames that are not later than the one before.
+    As a reader under ``skip_bad`` it leaves out frames that are not later than the one before.
 
     Args:
         plan: of the clip.

@@ -25,8 +25,8 @@ from engram.errors import InputError
 from engram.fleet.build.building import find_best_order
 from engram.fleet.build.orders import JudgeOptions
 from engram.fleet.download.downloading import DownloadReport, download
+from engram.fleet.download.mission import DownloadOptions, DownloadSettings
 from engram.fleet.merge.merging import merge as merge_maps
-from engram.fleet.settings import DownloadSettings
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, SessionId, node_id, path_id
 from engram.localiser.acceptance import accept_lost
@@ -208,7 +208,7 @@ def _downloaded(
     """What a robot gets: where nothing was driven at such an hour it asks for more."""
     try:
         strict = policy in _ASKS_FOR_MORE
-        options = asked.options(policy, depart_h=hour, arrive_h=hour, strict=strict)
+        options = DownloadOptions.of(asked, policy, depart_h=hour, arrive_h=hour, strict=strict)
         return download(whole, draft, options)
     except InputError:
         if policy not in _ASKS_FOR_MORE:
@@ -462,7 +462,7 @@ def try_downloads_for(
         localise=arm.driving,
         start=partial(_start, plan, fold, drive),
     )
-    wanted = partial(plan.tables.download.options, thumbnails=False)
+    wanted = partial(DownloadOptions.of, plan.tables.download, thumbnails=False)
     found, refused = trials({COPY: wanted(COPY)}), {}
     if hour_of_day(drive.session, drive.session.start_ns) is not None:
         for one in _BY_HOUR:
