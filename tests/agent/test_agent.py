@@ -300,9 +300,14 @@ def test_after_a_fall_back_only_what_is_new_is_handed_in(site):
     assert second.hand_in() is None
 
 
-def test_a_settings_file_that_is_gone_is_named(tmp_path):
-    with pytest.raises(ConfigError, match=r"none\.toml: the file is missing"):
-        _open(tmp_path, tmp_path / "none.toml")
+def test_the_settings_of_an_agent_lie_in_its_folder(site):
+    folder = site.robot("r1").folder
+    (folder / "agent.toml").write_text("bytes_per_s = 1000\n")
+    with _open(folder) as agent:
+        assert agent.settings.bytes_per_s == 1000
+    (folder / "agent.toml").write_text("bytes_per_second = 1000\n")
+    with pytest.raises(ConfigError, match="did you mean bytes_per_s"):
+        _open(folder)
 
 
 def test_a_sync_that_failed_tells_scripts_so(site, capsys):
