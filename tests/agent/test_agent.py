@@ -8,10 +8,10 @@ from tests.centre.conftest import Site, admit_here, drive
 
 from engram.cli.options import PartlyDoneError
 from engram.config import load_toml
-from engram.errors import ConfigError, IncompatibleError, InputError, StorageFullError
+from engram.errors import ConfigError, IncompatibleError, InputError, MapError, StorageFullError
 from engram.fleet.agent.agent import Agent
-from engram.fleet.agent.link import CentreRefusedError, Unreachable, enrol
-from engram.fleet.agent.state import AgentSettings, AgentState
+from engram.fleet.agent.agent_state import AgentSettings, AgentState
+from engram.fleet.agent.centre_link import CentreRefusedError, Unreachable, enrol
 from engram.fleet.centre import merge_job
 from engram.fleet.centre.serving import back_up
 from engram.fleet.cli.agent_verbs import _open, sync
@@ -134,7 +134,7 @@ def test_a_hand_in_of_more_parts_than_one_answer_names_is_sent_whole(site, monke
 
 
 def test_a_download_of_more_parts_than_one_request_names_is_fetched_whole(site, monkeypatch):
-    monkeypatch.setattr("engram.fleet.agent.outbox._ASKED_AT_ONCE", 3)
+    monkeypatch.setattr("engram.fleet.agent.fetching._REQUESTED_AT_ONCE", 3)
     first, second = site.robot("r1"), site.robot("r2")
     drive(first.live, "r1", 1_000, 10)
     first.hand_in()
@@ -331,3 +331,10 @@ def test_half_an_enrolment_a_lost_key_and_a_file_in_the_way_are_named(site, tmp_
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="file cannot hold an agent: Not a directory"):
         enrol(tmp_path / "file", "http://centre", "code", "r1", site.http)
+
+
+def test_a_fact_that_is_not_one_is_named_with_its_file(site):
+    agent = site.robot("r1")
+    agent.state.remember(staged=3)
+    with pytest.raises(MapError, match=r"agent\.sqlite holds an invalid fact .*staged.*enrol"):
+        agent.status()

@@ -15,7 +15,7 @@ from sqlalchemy import create_engine, make_url, text
 from tests.maps.maps import begin, session, write_drive
 
 from engram.fleet.agent.agent import Agent
-from engram.fleet.agent.link import enrol
+from engram.fleet.agent.centre_link import enrol
 from engram.fleet.centre import merge_job
 from engram.fleet.centre.access import Role, add_person, new_code
 from engram.fleet.centre.application import create_app

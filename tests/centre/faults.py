@@ -10,7 +10,7 @@ from typing import Any
 import httpx
 from sqlalchemy import Engine, event
 
-from engram.fleet.agent.state import AgentState
+from engram.fleet.agent.agent_state import AgentState
 
 _CALLS = ("fsync", "replace", "rename", "link", "unlink")
 

@@ -14,7 +14,7 @@ import uvicorn
 from sqlalchemy import delete, insert
 
 from engram.errors import ConfigError, InputError
-from engram.fleet.agent.link import CentreRefusedError, enrol
+from engram.fleet.agent.centre_link import CentreRefusedError, enrol
 from engram.fleet.centre import dreams, serving
 from engram.fleet.centre.access import Role, add_person, disable, new_code, revoke_access
 from engram.fleet.centre.database import _hash, first_broken
@@ -116,15 +116,13 @@ def used(tmp_path_factory):
         from engram.fleet.centre.tables import grants
 
         connection.execute(
-            update(grants)
-            .where(grants.c.subject == foreign.state.fact("robot"))
-            .values(map="other")
+            update(grants).where(grants.c.subject == foreign.state.facts.robot).values(map="other")
         )
     tokens = {str(role): site.token(role) for role in Role if role is not Role.ROBOT}
     tokens |= {f"{role} elsewhere": site.token(role, "other") for role in Role if role != "robot"}
     tokens |= {None: {}, "own": own.link._headers(), "robot": robot.link._headers()}
     tokens["robot elsewhere"] = foreign.link._headers()
-    handin = own.state.fact("handin")
+    handin = own.state.facts.handin
     revision = site.centre.map_path(NAME)
     assert revision.exists()
     artifact = site.http.post(
@@ -141,7 +139,7 @@ def used(tmp_path_factory):
         "job": next(iter(handin.values())),
         "artifact": artifact,
         "ref": "head",
-        "robot": own.state.fact("robot"),
+        "robot": own.state.facts.robot,
         "node": "0",
         "part": "00" * 32,
     }
@@ -191,7 +189,7 @@ def test_who_has_another_map_learns_nothing_of_this_one(used, route):
 def test_a_robot_that_is_taken_away_has_no_token_and_gets_none(site):
     agent = site.robot("r1")
     agent.step()
-    key = agent.state.fact("robot")
+    key = agent.state.facts.robot
     answer = site.http.delete(f"/v1/maps/{NAME}/robots/{key}", headers=site.token("admin"))
     assert answer.status_code == 204
     assert agent.step() > 0
@@ -309,7 +307,7 @@ def test_a_robot_that_enrols_again_has_its_new_name_and_one_taken_away_is_told(s
 
     again()
     assert [row.name for row in robots_of(site.centre, NAME)] == ["renamed"]
-    disable(site.centre, agent.state.fact("robot"), "tests")
+    disable(site.centre, agent.state.facts.robot, "tests")
     with pytest.raises(CentreRefusedError, match=r"\(403\): this robot was removed"):
         again()
 
@@ -326,7 +324,7 @@ def test_a_person_or_robot_is_taken_away_by_name(site):
     enrol(second.folder, "http://centre", code, "r1", site.http)
     with pytest.raises(InputError, match="2 robots are called 'r1'"):
         revoke_access(site.centre, "r1", "tests")
-    revoke_access(site.centre, first.state.fact("robot"), "tests")
+    revoke_access(site.centre, first.state.facts.robot, "tests")
     first.step()
     second.step()
     assert "was removed" in str(first.trouble)

@@ -94,7 +94,7 @@ def test_what_a_person_hid_is_not_dreamt_of_until_it_is_handed_in_again(site, in
     with Map.open(site.centre.map_path(NAME)) as store:
         store.revert(1, author="tests")
     (row,) = dreams.merged_handins(site.centre, NAME)
-    assert row.robot == site.robot("r2").state.fact("robot")
+    assert row.robot == site.robot("r2").state.facts.robot
     handed_in(site, "r1", 9_000)
     assert len(dreams.merged_handins(site.centre, NAME)) == 2
 
@@ -109,7 +109,7 @@ def test_a_robots_map_is_put_together_with_what_it_got_from_the_fleet(site, in_p
     (row,) = [
         one
         for one in dreams.merged_handins(site.centre, NAME)
-        if one.robot == second.state.fact("robot")
+        if one.robot == second.state.facts.robot
     ]
     manifest = handins.manifest_of(site.centre, row)
     path = tmp_path / "r2.engram"

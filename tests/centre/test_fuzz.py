@@ -43,7 +43,7 @@ def used(tmp_path_factory):
     site.centre.set_policy(NAME, replace(POLICY, gate=("a", "b", "c")), "tests")
     with Map.open(own.live) as store:
         node = str(store.graph.nodes[0].id)
-    handin = next(iter(own.state.fact("handin").values()))
+    handin = next(iter(own.state.facts.handin.values()))
     yield (
         site,
         tokens,
@@ -54,7 +54,7 @@ def used(tmp_path_factory):
             "dream": dreams.ask(site.centre, NAME, "tests").id,
             "artifact": asked["id"],
             "ref": "head",
-            "robot": own.state.fact("robot"),
+            "robot": own.state.facts.robot,
             "node": node,
             "part": "00" * 32,
         },

@@ -100,7 +100,7 @@ def test_the_parts_of_another_robot_are_not_taken_by_their_hashes(site, robot):
     assert answer.status_code == 409
     headers = thief.link._headers()
     rows = site.http.get(f"/v1/maps/{NAME}/handins", headers=headers).json()["items"]
-    assert [row["robot"] for row in rows] == [thief.state.fact("robot")]
+    assert [row["robot"] for row in rows] == [thief.state.facts.robot]
     wanted = site.http.get(f"/v1/handins/{rows[0]['id']}", headers=headers).json()["wanted"]
     assert set(wanted) == {one.hex() for one in manifest.hashes()}
 

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from engram.fleet.agent.link import enrol
+from engram.fleet.agent.centre_link import enrol
 from engram.fleet.centre import merge_job
 from engram.fleet.centre.access import Role, add_person, new_code
 

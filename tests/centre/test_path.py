@@ -33,7 +33,7 @@ def test_a_robot_without_a_map_gets_one_and_switches_when_parked(site, in_proces
     site.settle()
     assert not second.live.exists()
     assert second.switch()
-    assert second.state.fact("runs").startswith("1-")
+    assert second.state.facts.runs.startswith("1-")
     with Map.open(second.live) as ours, Map.open(first.live) as theirs:
         assert ours.load().nodes == theirs.load().nodes
     drive(second.live, "r2", 5_000)

@@ -14,7 +14,7 @@ from tests.centre.conftest import drive
 
 from engram.errors import EngramError
 from engram.fleet.agent.agent import MAP
-from engram.fleet.agent.link import enrol
+from engram.fleet.agent.centre_link import enrol
 from engram.fleet.centre.access import new_code
 from engram.fleet.centre.service import Centre, MapPolicy
 from engram.fleet.merge.merge_settings import MergeOptions

@@ -181,7 +181,7 @@ class Manifest:
         tables = {}
         for name, pages in self.pages.items():
             kept = 0 if base is None else _common(base.pages.get(name, ()), pages)
-            tables[name] = WirePages(kept, [one.hex() for one in pages[kept:]])
+            tables[name] = WirePages(kept, [page.hex() for page in pages[kept:]])
         known = None if base is None else base.id
         return WireManifest(FORMAT, self.content_hash, self.revision, tables, known)
 
@@ -235,7 +235,7 @@ class WireManifest:
         before = () if base is None else base.pages.get(name, ())
         if not 0 <= given.kept <= len(before):
             raise InputError(f"{name}: {given.kept} pages kept of {len(before)}")
-        return before[: given.kept] + tuple(_hash(one) for one in given.pages)
+        return before[: given.kept] + tuple(_hash(page) for page in given.pages)
 
 
 def decode_manifest(body: bytes) -> Manifest:
@@ -257,8 +257,8 @@ def encode_manifest(manifest: Manifest) -> bytes:
 
 def _common(ours: tuple[PartHash, ...], theirs: tuple[PartHash, ...]) -> int:
     """How many pages at the beginning are equal."""
-    for at, (one, other) in enumerate(zip(ours, theirs, strict=False)):
-        if one != other:
+    for at, (our, their) in enumerate(zip(ours, theirs, strict=False)):
+        if our != their:
             return at
     return min(len(ours), len(theirs))
 
@@ -374,11 +374,11 @@ class Split:
     def parts(self, wanted: Sequence[PartHash]) -> Iterator[bytes]:
         """The wanted parts that it has, in their order."""
         with closing(MapRows(self.location, self.manifest.revision)) as rows:
-            for one in wanted:
-                if one in self.pages:
-                    yield self.pages[one]
-                elif one in self.blobs:
-                    table, key, at = self.blobs[one]
+            for part in wanted:
+                if part in self.pages:
+                    yield self.pages[part]
+                elif part in self.blobs:
+                    table, key, at = self.blobs[part]
                     yield rows.one(table, key)[at]
 
 

@@ -30,9 +30,9 @@ from pathlib import Path
 
 from engram.errors import EngramError
 from engram.fleet.agent.agent import Agent
-from engram.fleet.agent.link import enrol
+from engram.fleet.agent.agent_state import AgentSettings
+from engram.fleet.agent.centre_link import enrol
 from engram.fleet.agent.outbox import QUEUED, SENT
-from engram.fleet.agent.state import AgentSettings
 from engram.fleet.centre import handins
 from engram.fleet.centre.access import new_code
 from engram.fleet.centre.database import first_broken
@@ -98,7 +98,7 @@ def live(folder: Path, name: str) -> None:
 
 def _waits(agent: Agent) -> bool:
     """Whether something of the robot is not at the centre yet."""
-    return bool({row["state"] for row in agent.state.outbox()} & {QUEUED, SENT})
+    return bool({entry.state for entry in agent.state.outbox()} & {QUEUED, SENT})
 
 
 def _hand_in(agent: Agent, copies: Path) -> None:

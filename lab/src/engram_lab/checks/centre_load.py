@@ -31,7 +31,7 @@ import httpx
 import numpy as np
 
 from engram.fleet.agent.agent import Agent
-from engram.fleet.agent.link import enrol, new_client
+from engram.fleet.agent.centre_link import enrol, new_client
 from engram.fleet.centre.access import new_code
 from engram.fleet.centre.service import Centre, MapPolicy
 from engram.fleet.merge.merge_settings import MergeOptions
@@ -208,7 +208,7 @@ def visible_s(folder: Path, number: int) -> float:
         started = time.perf_counter()
         while agent.step(fetch=False) == 0:
             pass
-        key = agent.state.fact("handin")[entry]
+        key = agent.state.facts.handin[entry or ""]
         while agent.link.ask("GET", f"/v1/handins/{key}")["state"] == "complete":
             time.sleep(_ASK_S)
         return time.perf_counter() - started

@@ -17,9 +17,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from engram.fleet.agent.agent import Agent
-from engram.fleet.agent.link import enrol, new_client
+from engram.fleet.agent.agent_state import AgentSettings
+from engram.fleet.agent.centre_link import enrol, new_client
 from engram.fleet.agent.outbox import QUEUED
-from engram.fleet.agent.state import AgentSettings
 from engram.fleet.centre.access import new_code
 from engram.graph.model import Attempt, PathEntry, PathEntryKind, path_id
 from engram.graph.paths import Attempts
@@ -114,7 +114,7 @@ class Line:
 
     @staticmethod
     def _is_queued(agent: Agent) -> bool:
-        return any(row["state"] == QUEUED for row in agent.state.outbox())
+        return any(entry.state == QUEUED for entry in agent.state.outbox())
 
 
 def measured(folder: Path) -> list[Figure]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from engram.config import plain
-from engram.fleet.agent.link import enrol
+from engram.fleet.agent.centre_link import enrol
 from engram.fleet.centre.access import Role, add_person, new_code
 from engram.fleet.centre.service import Centre
 from engram.maps.map import Map

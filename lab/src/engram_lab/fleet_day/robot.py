@@ -12,9 +12,9 @@ import numpy as np
 
 from engram.errors import EngramError
 from engram.fleet.agent.agent import MAP, Agent
-from engram.fleet.agent.link import Unreachable
+from engram.fleet.agent.agent_state import AgentSettings
+from engram.fleet.agent.centre_link import Unreachable
 from engram.fleet.agent.outbox import QUEUED, SENT
-from engram.fleet.agent.state import AgentSettings
 from engram.fleet.centre.merge_job import merge_hand_in
 from engram.fleet.centre.service import Centre
 from engram.fleet.centre.worker import work_off
@@ -165,7 +165,7 @@ class DayRobot:
         with self._monitor.stage(what, _ROUNDS) as part:
             for _ in range(_ROUNDS):
                 agent.step(fetch=fetch)
-                failed = [row["error"] for row in agent.state.outbox() if row["error"]]
+                failed = [entry.error for entry in agent.state.outbox() if entry.error]
                 if failed:
                     raise EngramError(f"{what}: {failed[0]}")
                 if agent.trouble is None and is_over():
@@ -182,7 +182,7 @@ class DayRobot:
 
 
 def _is_none_left(agent: Agent, state: str) -> bool:
-    return all(row["state"] != state for row in agent.state.outbox())
+    return all(entry.state != state for entry in agent.state.outbox())
 
 
 def _nodes(path: Path) -> int:

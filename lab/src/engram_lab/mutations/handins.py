@@ -12,7 +12,7 @@ import msgspec
 from fastapi.testclient import TestClient
 
 from engram.fleet.agent.agent import Agent
-from engram.fleet.agent.link import enrol
+from engram.fleet.agent.centre_link import enrol
 from engram.fleet.centre import handins, jobs
 from engram.fleet.centre.access import new_code
 from engram.fleet.centre.application import create_app
@@ -142,7 +142,7 @@ class Site:
         chance.choice(kinds)(chance)
         work_off(self.centre, merge_hand_in)
         for row in handins.listed(self.centre, _MAP, state="open"):
-            if row.robot == self._thief.state.fact("robot"):
+            if row.robot == self._thief.state.facts.robot:
                 jobs.cancel(self.centre, row, "lab")
 
     def states(self) -> Counter[str]:
@@ -203,7 +203,7 @@ class Site:
         mine = {} if chance.random() < 0.5 else {part_hash(b"x"): b"x"}
         self._ask("POST", f"/v1/handins/{key}/parts", content=b"".join(bundle(mine.values())))
         self._ask("POST", f"/v1/handins/{key}/complete")
-        its = self._victim.state.fact("robot")
+        its = self._victim.state.facts.robot
         self._ask("GET", f"/v1/maps/{_MAP}/robots/{its}")
 
     def _path(self, chance: random.Random) -> None:

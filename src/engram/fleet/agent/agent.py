@@ -30,9 +30,10 @@ from engram.errors import (
     storage_full,
 )
 from engram.files import WriterLock
-from engram.fleet.agent.link import PARTS, Link, enrolled, new_client, signer_of
-from engram.fleet.agent.outbox import FAILED, QUEUED, SENT, Fetch, Outbox
-from engram.fleet.agent.state import AgentSettings
+from engram.fleet.agent.agent_state import AgentSettings
+from engram.fleet.agent.centre_link import FOLDERS, CentreLink, enrolled, new_client, signer_of
+from engram.fleet.agent.fetching import fetch_map
+from engram.fleet.agent.outbox import FAILED, QUEUED, SENT, Outbox
 from engram.maps.map import Map
 from engram.maps.map_files import check_file, copy_map
 
@@ -73,17 +74,18 @@ class Agent:
         self.settings = settings or AgentSettings()
         self.state = enrolled(folder)
         self.trouble: EngramError | None = None
-        self._failures: int = self.state.fact("failures", 0)
+        facts = self.state.facts
+        self._failures = facts.failures or 0
         self._chance = chance
         self._owns_client = client is None
         self.live = folder / "live" / MAP
-        for part in PARTS:
-            (folder / part).mkdir(exist_ok=True)
+        for name in FOLDERS:
+            (folder / name).mkdir(exist_ok=True)
         signer = signer_of(folder / "key")
-        self._map = self.state.fact("map")
-        self.link = Link(
-            client or new_client(self.state.fact("url")),
-            self.state.fact("robot"),
+        self._map = facts.map or ""
+        self.link = CentreLink(
+            client or new_client(facts.url or ""),
+            facts.robot or "",
             signer,
             self.settings.bytes_per_s,
             wait,
@@ -121,16 +123,16 @@ class Agent:
         Returns:
             Whether it fell back to the last good map.
         """
-        runs = self.state.fact("runs")
-        driven_m += self.state.fact("driven_m", 0.0)
+        facts = self.state.facts
+        driven_m += facts.driven_m or 0.0
         self.state.remember(share=localised_share, driven_m=driven_m)
-        if driven_m < self.settings.judged_m or self.state.fact("good") == runs:
+        if driven_m < self.settings.judged_m or facts.good == facts.runs:
             return False
         if (
             localised_share >= self.settings.least_share
             or not (self.folder / "base" / MAP).exists()
         ):
-            self.state.remember(good=runs)
+            self.state.remember(good=facts.runs)
             return False
         self.fall_back()
         return True
@@ -145,7 +147,11 @@ class Agent:
             Seconds until the next round.
         """
         try:
-            busy = self._round(fetch)
+            path = f"/v1/maps/{self._map}/robots/me/report"
+            wanted = self.link.ask("PUT", path, self._report())
+            self.state.remember(wanted=wanted["version"], durable=wanted["durable_revision"])
+            busy = self.outbox.send(self.link, wanted["durable_revision"])
+            busy = (fetch and self._fetch(wanted["revision"], wanted["version"])) or busy
             self.state.remember(failures=0, trouble="")
         except (EngramError, OSError) as error:
             return self._failed(error)
@@ -168,40 +174,34 @@ class Agent:
             error = storage_full(error, self.folder) or MapError(fact)
         self.trouble = error
         self._failures += 1
-        with suppress(MapError):  # of a full disk: what it would not note is told below
+        with suppress(MapError):  # of a full disk: what it could not note is logged below
             self.state.remember(failures=self._failures, trouble=str(error))
         longest: float = self.settings.first_retry_s * 2.0 ** min(self._failures - 1, 40)
         pause_s = min(longest, self.settings.longest_retry_s) * (0.5 + self._chance() / 2)
         _log.info("%s; tried again in %.0f s", error, pause_s)
         return pause_s
 
-    def _round(self, fetch: bool) -> bool:
-        wanted = self.link.ask("PUT", f"/v1/maps/{self._map}/robots/me/report", self._report())
-        self.state.remember(wanted=wanted["version"], durable=wanted["durable_revision"])
-        busy = self.outbox.send(self.link, wanted["durable_revision"])
-        return (fetch and self._fetch(wanted["revision"], wanted["version"])) or busy
-
     def _report(self) -> dict[str, Any]:
-        fact = self.state.fact
-        kept = [row for row in self.state.outbox() if row["state"] != FAILED]
+        facts = self.state.facts
         return {
-            "runs": fact("runs"),
-            "localised_share": fact("share"),
-            "driven_m": fact("driven_m"),
-            "outbox": len(kept),
-            "told": str(fact("trouble", ""))[:500],
+            "runs": facts.runs,
+            "localised_share": facts.share,
+            "driven_m": facts.driven_m,
+            "outbox": sum(entry.state != FAILED for entry in self.state.outbox()),
+            "told": (facts.trouble or "")[:500],
         }
 
     def _fetch(self, revision: int, version: str) -> bool:
         """Fetches the wanted version, unless it is running, staged or rejected."""
-        known = {self.state.fact("runs"), self.state.fact("staged"), self.state.fact("rejected")}
-        if revision == 0 or version in known:
+        facts = self.state.facts
+        if revision == 0 or version in {facts.runs, facts.staged, facts.rejected}:
             return False
         path = self.folder / "next" / "download.engram"
-        fetched = [version, self.settings.download]
-        if self.state.fact("fetched") != fetched or not path.exists():
-            fetch = Fetch(self.state, self._map, self.live)
-            if not fetch.fetch(self.link, revision, self.settings.download, path):
+        fetched = (version, self.settings.download)
+        if facts.fetched != fetched or not path.exists():
+            wanted = {"ref": str(revision), "options": self.settings.download}
+            request = f"/v1/maps/{self._map}/downloads"
+            if not fetch_map(self.link, self.state, request, wanted, self.live, path):
                 return False
             self.state.remember(fetched=fetched)
             _log.info("fetched version %s: %d bytes received", version, self.link.received_bytes)
@@ -247,7 +247,7 @@ class Agent:
         Raises:
             MapLockedError: the live process still writes to the map.
         """
-        staged, version = self.folder / "next" / MAP, self.state.fact("staged")
+        staged, version = self.folder / "next" / MAP, self.state.facts.staged
         if version is None:
             return False
         if not staged.exists():  # killed after the rename, before this was noted
@@ -278,18 +278,16 @@ class Agent:
             base.replace(self.live)
         finally:
             lock.release()
-        rejected = self.state.fact("runs")
-        self.state.remember(
-            rejected=rejected, runs=self.state.fact("runs_before"), share=None, driven_m=0.0
-        )
+        facts = self.state.facts
+        self.state.remember(rejected=facts.runs, runs=facts.runs_before, share=None, driven_m=0.0)
 
     @property
-    def waits(self) -> bool:
+    def is_pending(self) -> bool:
         """Whether a version or the result of a hand-in is pending."""
-        fact = self.state.fact
-        known = {fact("runs"), fact("staged"), fact("rejected"), None, "0"}
-        open_states = {row["state"] for row in self.state.outbox()} & {QUEUED, SENT}
-        return bool(open_states) or fact("wanted") not in known
+        facts = self.state.facts
+        known = {facts.runs, facts.staged, facts.rejected, None, "0"}
+        unsettled = any(entry.state in {QUEUED, SENT} for entry in self.state.outbox())
+        return unsettled or facts.wanted not in known
 
     def status(self) -> dict[str, Any]:
         """The state, as ``engram agent status --json`` prints it."""
@@ -297,17 +295,24 @@ class Agent:
             "robot", "name", "url", "map", "runs", "wanted", "staged", "rejected", "durable",
             "share", "driven_m", "failures", "trouble",
         )  # fmt: skip
+        facts = self.state.facts
         outbox = [
-            {key: row[key] for key in ("id", "state", "bytes", "revision", "error")}
-            for row in self.state.outbox()
+            {
+                "id": entry.id,
+                "state": entry.state,
+                "bytes": entry.size_bytes,
+                "revision": entry.revision,
+                "error": entry.error,
+            }
+            for entry in self.state.outbox()
         ]
-        return {**{name: self.state.fact(name) for name in names}, "outbox": outbox}
+        return {**{name: getattr(facts, name) for name in names}, "outbox": outbox}
 
     def _moved_on(self) -> bool:
         if not self.live.exists():
             return False
         with Map.open(self.live) as store:
-            return bool(store.revision != self.state.fact("staged_on"))
+            return bool(store.revision != self.state.facts.staged_on)
 
     def _keep_as_base(self) -> None:
         base = self.folder / "base" / MAP
@@ -321,7 +326,7 @@ class Agent:
 
     def _installed(self, version: str) -> None:
         self.state.remember(
-            runs_before=self.state.fact("runs"),
+            runs_before=self.state.facts.runs,
             runs=version,
             staged=None,
             share=None,
@@ -331,5 +336,5 @@ class Agent:
 
 def _clear(path: Path) -> None:
     """Removes a map file with the files that SQLite left next to it."""
-    for one in path.parent.glob(f"{path.name}*"):
-        one.unlink()
+    for left in path.parent.glob(f"{path.name}*"):
+        left.unlink()

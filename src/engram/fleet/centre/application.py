@@ -67,9 +67,9 @@ class _Counting:
 
         async def request() -> Message:
             nonlocal waited_s
-            asked = time.perf_counter()
+            began = time.perf_counter()
             message = await receive()
-            waited_s += time.perf_counter() - asked
+            waited_s += time.perf_counter() - began
             return message
 
         async def answer(message: Message) -> None:

@@ -386,7 +386,8 @@ def first_broken(connection: Connection) -> int | None:
     """Number of the first row that was changed, removed or added later; None for a whole log."""
     before = ""
     query = select(audit).order_by(audit.c.number).execution_options(yield_per=1000)
-    for number, row in enumerate((Event(*one) for one in connection.execute(query)), 1):
+    for number, values in enumerate(connection.execute(query), 1):
+        row = Event(*values)
         if row.number != number or row.hash != _hash(before, row):
             return number
         before = row.hash

@@ -215,8 +215,17 @@ def merge_hand_in(centre: Centre, row: HandIn) -> None:
     begun_s = time.monotonic()
     try:
         with _scratch(thin):
-            _admit(centre, row, thin)
-            report = _merged(centre, row, thin)
+            policy, manifest = centre.policy(row.map), handins.manifest_of(centre, row)
+            parts, limits = handins.parts_to_merge(centre, row, manifest), centre.settings
+            admit(manifest, parts, thin, limits.admission_bytes, limits.admission_s)
+            (report,) = merge(
+                centre.map_path(row.map),
+                [thin],
+                policy.merge,
+                JobMonitor(partial(jobs.heartbeat, centre, row)),
+                settings=Settings(),
+                require_better=[] if row.ungated else [Path(drive) for drive in policy.gate],
+            )
     except MissingPartsError:  # the map changed since they were requested, by a revert
         jobs.set_state(centre, row, JobState.OPEN, tries=0)
     except RefusedError as error:
@@ -244,25 +253,6 @@ def merge_hand_in(centre: Centre, row: HandIn) -> None:
 
 def _end(centre: Centre, row: HandIn, why: str, state: JobState = JobState.FAILED) -> None:
     jobs.set_state(centre, row, state, error=why)
-
-
-def _admit(centre: Centre, row: HandIn, thin: Path) -> None:
-    manifest, limits = handins.manifest_of(centre, row), centre.settings
-    parts = handins.parts_to_merge(centre, row, manifest)
-    admit(manifest, parts, thin, limits.admission_bytes, limits.admission_s)
-
-
-def _merged(centre: Centre, row: HandIn, thin: Path) -> MergeReport:
-    policy = centre.policy(row.map)
-    (report,) = merge(
-        centre.map_path(row.map),
-        [thin],
-        policy.merge,
-        JobMonitor(partial(jobs.heartbeat, centre, row)),
-        settings=Settings(),
-        require_better=[] if row.ungated else [Path(drive) for drive in policy.gate],
-    )
-    return report
 
 
 def _settle(centre: Centre, row: HandIn, report: MergeReport) -> None:

@@ -313,7 +313,7 @@ class Centre:
         back = update(refs).where(ahead).values(revision=head, version=refs.c.version + 1)
         kept = (maps.c.name == name) & (maps.c.durable_revision > head)
         durable = update(maps).where(kept).values(durable_revision=head)
-        changed = [connection.execute(one).rowcount for one in (again, back, durable)]
+        changed = [connection.execute(change).rowcount for change in (again, back, durable)]
         if any(changed):
             note(connection, now, by, "older-file", name, revision=head, handins=changed[0])
 

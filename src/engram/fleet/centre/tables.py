@@ -56,7 +56,7 @@ def _table(name: str, row: type, *key: str, index: tuple[str, ...] = ()) -> Tabl
     """The table of a class of rows: a column for each field, by its type."""
     columns = []
     for field, hint in get_type_hints(row).items():
-        known = [one for one in get_args(hint) if one is not type(None)]
+        known = [part for part in get_args(hint) if part is not type(None)]
         kind = known[0] if isinstance(hint, UnionType) else hint
         column: Column[Any] = Column(
             field,
@@ -73,7 +73,7 @@ def _table(name: str, row: type, *key: str, index: tuple[str, ...] = ()) -> Tabl
 
 def values_of(row: object) -> dict[str, Any]:
     """The columns of a row by name."""
-    return {one.name: getattr(row, one.name) for one in fields(row)}  # type: ignore[arg-type]
+    return {column.name: getattr(row, column.name) for column in fields(row)}  # type: ignore[arg-type]
 
 
 class JobState(StrEnum):

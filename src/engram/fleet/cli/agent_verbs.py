@@ -32,7 +32,7 @@ def _open(folder: Path) -> Agent:
     from engram.config import load_toml
     from engram.errors import ConfigError
     from engram.fleet.agent.agent import Agent
-    from engram.fleet.agent.state import AgentSettings
+    from engram.fleet.agent.agent_state import AgentSettings
     from engram.untrusted import read_text
 
     config = folder / "agent.toml"
@@ -57,7 +57,7 @@ def enrol(
     Examples:
       engram agent enrol r1 https://town.example:8440 CODE --robot r1
     """
-    from engram.fleet.agent.link import enrol as enrol_robot
+    from engram.fleet.agent.centre_link import enrol as enrol_robot
 
     typer.echo(f"{robot} is a robot of {enrol_robot(folder, url, code, robot)}")
 
@@ -108,7 +108,7 @@ def sync(
     waiting = threading.Event()
     with _open(folder) as agent:
         until_s = time.monotonic() + wait_s
-        while (pause_s := agent.step()) == 0 or (agent.waits and time.monotonic() < until_s):
+        while (pause_s := agent.step()) == 0 or (agent.is_pending and time.monotonic() < until_s):
             waiting.wait(min(pause_s, _LOOK_S))
         if agent.trouble is None or not as_json:
             _print(agent, as_json=as_json)

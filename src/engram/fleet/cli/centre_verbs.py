@@ -117,9 +117,9 @@ def _gate(drives: list[Path]) -> tuple[str, ...]:
 
     if drives == [Path(NONE)]:
         return ()
-    for one in drives:
-        open_drive(one)
-    return tuple(str(one.absolute()) for one in drives)
+    for drive in drives:
+        open_drive(drive)
+    return tuple(str(drive.absolute()) for drive in drives)
 
 
 def _movable(ref: str) -> str | None:
@@ -140,7 +140,7 @@ def _hours(text: str) -> tuple[float, float] | None:
         found = float(begin), float(end)
     except ValueError:
         found = (-1.0, -1.0)
-    if not all(0.0 <= one <= 24.0 for one in found):
+    if not all(0.0 <= hour <= 24.0 for hour in found):
         raise ConfigError(f"--quiet {text!r:.40} is not FROM-TO in hours of the day, such as 22-5")
     return found
 
@@ -164,14 +164,14 @@ def dream(
       engram centre dream town
     """
     from engram.fleet.centre import dreams, jobs
-    from engram.fleet.centre.tables import Dream, values_of
+    from engram.fleet.centre.tables import Dream
 
     with open_centre(folder) as centre:
         if cancel is None:
             row = dreams.ask(centre, map_name, BY)
         else:
             row = jobs.cancel(centre, jobs.get(centre, Dream, cancel), BY)
-    typer.echo(json.dumps(values_of(row)) if as_json else _line(row))
+    typer.echo(json.dumps(_plain(row)) if as_json else _line(row))
 
 
 def jobs(
@@ -193,7 +193,7 @@ def jobs(
     """
     from engram.fleet.centre import dreams, handins
     from engram.fleet.centre import jobs as any_job
-    from engram.fleet.centre.tables import HandIn, values_of
+    from engram.fleet.centre.tables import HandIn
 
     with open_centre(folder) as centre:
         centre.map_row(map_name)
@@ -202,13 +202,20 @@ def jobs(
         rows = handins.listed(centre, map_name, limit=1000)
         dreamt = dreams.listed(centre, map_name)
     if as_json:
-        listed = {"jobs": list(map(values_of, rows)), "dreams": list(map(values_of, dreamt))}
-        print(json.dumps(listed))
+        print(json.dumps({"jobs": list(map(_plain, rows)), "dreams": list(map(_plain, dreamt))}))
         return
     for row in reversed(rows):
         typer.echo(_line(row))
     for dreamed in reversed(dreamt):
         typer.echo(f"dream {_line(dreamed)}")
+
+
+def _plain(row: HandIn | Dream) -> dict[str, Any]:
+    """A job for scripts, which read its report as JSON of its own."""
+    from engram.fleet.centre.tables import values_of
+
+    report = None if row.report is None else json.dumps(row.report)
+    return {**values_of(row), "report": report}
 
 
 def _line(row: HandIn | Dream) -> str:
@@ -331,7 +338,7 @@ def token(
     """
     from engram.fleet.centre.access import Role, add_person, revoke_access
 
-    roles = [str(one) for one in Role if one is not Role.ROBOT]
+    roles = [str(known) for known in Role if known is not Role.ROBOT]
     if role not in {*roles, NONE}:
         raise ConfigError(f"--role {role!r} is unknown; known: {', '.join(roles)}, {NONE}")
     with open_centre(folder) as centre:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 from msgspec import Meta
 from sqlalchemy import MetaData
 
@@ -41,6 +42,64 @@ CREATE TABLE IF NOT EXISTS arrived (hash BLOB PRIMARY KEY, body BLOB NOT NULL) S
 """
 
 
+@dataclass(frozen=True, slots=True)
+class AgentFacts:
+    """What an agent knows of its robot; None where it does not know yet.
+
+    Attributes:
+        url, robot, map, name: the centre, the robot's id there, its map, and its own name.
+        runs: version of the map that the robot drives with.
+        runs_before: the one before it, which `base` holds.
+        wanted: version that the centre wants on the robot.
+        durable: revision that a backup of the centre holds.
+        staged: version that is ready for the next switch.
+        staged_on: revision of the live map from which it was staged.
+        fetched: version and options of the download in `next`.
+        rejected: version that served badly.
+        good: version that served well.
+        share, driven_m: share of frames that it localised so far, and distance driven, metres.
+        failures: rounds that failed since the last good one.
+        trouble: why the last round failed; empty after a good one.
+        last_queued: the newest hand-in.
+        base: manifest that the centre has, as JSON.
+        handin: ids at the centre of the hand-ins in the outbox.
+    """
+
+    url: str | None = None
+    robot: str | None = None
+    map: str | None = None
+    name: str | None = None
+    runs: str | None = None
+    runs_before: str | None = None
+    wanted: str | None = None
+    durable: int | None = None
+    staged: str | None = None
+    staged_on: int | None = None
+    fetched: tuple[str, dict[str, Any]] | None = None
+    rejected: str | None = None
+    good: str | None = None
+    share: float | None = None
+    driven_m: float | None = None
+    failures: int | None = None
+    trouble: str | None = None
+    last_queued: str | None = None
+    base: str | None = None
+    handin: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class OutboxEntry:
+    """A hand-in that the robot keeps."""
+
+    id: str  # of its manifest
+    place: int
+    manifest: bytes
+    state: str
+    size_bytes: int
+    revision: int | None
+    error: str | None
+
+
 class AgentState:
     """Facts, the outbox, parts that both sides have, and parts that have arrived.
 
@@ -53,6 +112,7 @@ class AgentState:
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._errors = SqliteFile(path, _FILE).errors
         with self._errors():
             self._connection = sqlite3.connect(
@@ -85,15 +145,19 @@ class AgentState:
         with self._errors():
             return self._connection.execute(query, values).fetchall()
 
-    def fact(self, name: str, default: Any = None) -> Any:
-        """A remembered value; plain data."""
-        rows = self._rows("SELECT value FROM facts WHERE name = ?", name)
-        return json.loads(rows[0][0]) if rows else default
+    @property
+    def facts(self) -> AgentFacts:
+        """What the agent knows now: other processes of the robot write it, too."""
+        rows = self._rows("SELECT name, value FROM facts")
+        try:
+            return msgspec.convert({name: json.loads(value) for name, value in rows}, AgentFacts)
+        except ValueError as error:  # msgspec's, too
+            raise MapError(f"{self._path} holds an invalid fact ({error}); {_FILE.cure}") from error
 
     def remember(self, **facts: Any) -> None:
-        """Remembers values, all or none."""
+        """Changes facts, by the names of `AgentFacts`: all or none."""
+        rows = [(name, json.dumps(value)) for name, value in facts.items()]
         with self._writing() as connection:
-            rows = [(name, json.dumps(value)) for name, value in facts.items()]
             connection.executemany("INSERT OR REPLACE INTO facts VALUES (?, ?)", rows)
 
     # -- the outbox
@@ -112,14 +176,12 @@ class AgentState:
             if added.rowcount:
                 connection.executemany(
                     "INSERT INTO waiting VALUES (?, ?, ?)",
-                    [(key, one, body) for one, body in parts.items()],
+                    [(key, part, body) for part, body in parts.items()],
                 )
 
-    def outbox(self) -> list[dict[str, Any]]:
+    def outbox(self) -> list[OutboxEntry]:
         """The hand-ins that are kept, oldest first."""
-        names = ("id", "place", "manifest", "state", "bytes", "revision", "error")
-        rows = self._rows("SELECT * FROM outbox ORDER BY place")
-        return [dict(zip(names, row, strict=True)) for row in rows]
+        return [OutboxEntry(*row) for row in self._rows("SELECT * FROM outbox ORDER BY place")]
 
     def set_outbox(self, key: str, state: str, revision: int | None, error: str | None) -> None:
         """Notes how far a hand-in is."""
@@ -150,7 +212,7 @@ class AgentState:
     def share(self, parts: Iterable[PartHash]) -> None:
         """Notes parts that the centre has, from this robot or for it."""
         with self._writing() as connection:
-            rows = [(one,) for one in parts]
+            rows = [(part,) for part in parts]
             connection.executemany("INSERT OR IGNORE INTO shared VALUES (?)", rows)
 
     def shared(self) -> set[PartHash]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from engram.errors import EngramError, InputError, MissingExtraError, storage_full
-from engram.fleet.agent.state import AgentState
+from engram.fleet.agent.agent_state import AgentState
 from engram.fleet.transfers import PartHash, Signer, Unbundler, bundle, enrolment_text, token_text
 from engram.monitor import write_whole
 
@@ -49,7 +49,7 @@ def new_client(url: str, **options: Any) -> httpx.Client:
     return httpx.Client(base_url=url, timeout=30.0, **options)
 
 
-class Link:
+class CentreLink:
     """Requests of one robot.
 
     Args:
@@ -81,21 +81,41 @@ class Link:
         """Closes the client's connections."""
         self._client.close()
 
-    def ask(self, method: str, path: str, body: Any = None) -> Any:
-        """One request with JSON in and out.
+    def ask(
+        self,
+        method: str,
+        path: str,
+        body: Any = None,
+        parts: Callable[[], Iterator[bytes]] | None = None,
+    ) -> Any:
+        """One request with JSON out, and JSON or a bundle of parts in.
+
+        Parts that arrived stay at the centre, whatever happens then.
 
         Raises:
             CentreRefusedError: the centre answers with a problem.
             Unreachable: there is no answer.
         """
-        return self._ask(method, path, lambda: {"json": body} if body is not None else {})
+        import httpx
 
-    def send(self, path: str, parts: Callable[[], Iterator[bytes]]) -> Any:
-        """Sends parts in one bundle; what arrived stays there whatever happens then."""
-        headers = {"Content-Type": BUNDLE}
-        return self._ask(
-            "POST", path, lambda: {"content": self._paced(bundle(parts())), "headers": headers}
-        )
+        for _ in ("with the token so far", "with a new one"):
+            headers, options = self._headers(), dict[str, Any]()
+            if parts is not None:
+                headers["Content-Type"] = BUNDLE
+                options["content"] = self._paced(bundle(parts()))
+            elif body is not None:
+                options["json"] = body
+            try:
+                answer = self._client.request(method, path, headers=headers, **options)
+            except httpx.HTTPError as error:
+                raise _out_of_reach(error) from error
+            self.received_bytes += len(answer.content)
+            self.sent_bytes += int(answer.request.headers.get("content-length", 0))
+            if answer.status_code != 401:
+                break
+            self._token = ""
+        _check(answer)
+        return _content(answer) if answer.content else None
 
     def receive(self, path: str, wanted: list[PartHash]) -> Iterator[tuple[PartHash, bytes]]:
         """Parts of a bundle as they arrive, verified.
@@ -106,13 +126,13 @@ class Link:
         """
         import httpx
 
-        body = {"want": [one.hex() for one in wanted]}
+        body = {"want": [part.hex() for part in wanted]}
         opened = Unbundler()
         try:
             with self._client.stream("POST", path, json=body, headers=self._headers()) as answer:
                 if answer.status_code >= 400:
                     answer.read()
-                    self._refuse(answer)
+                    _check(answer)
                 for piece in answer.iter_bytes():  # in pieces of a size, a cut loses one
                     self.received_bytes += len(piece)
                     yield from opened.feed(piece)
@@ -120,45 +140,15 @@ class Link:
         except httpx.HTTPError as error:
             raise Unreachable(f"the connection broke: {error!r}") from error
 
-    def _ask(self, method: str, path: str, options: Callable[[], dict[str, Any]]) -> Any:
-        answer = self._request(method, path, options())
-        if answer.status_code == 401:
-            self._token = ""
-            answer = self._request(method, path, options())
-        self._refuse(answer)
-        return _content(answer) if answer.content else None
-
-    def _request(self, method: str, path: str, options: dict[str, Any]) -> httpx.Response:
-        import httpx
-
-        headers = {**options.pop("headers", {}), **self._headers()}
-        try:
-            answer = self._client.request(method, path, headers=headers, **options)
-        except httpx.HTTPError as error:
-            raise _out_of_reach(error) from error
-        self.received_bytes += len(answer.content)
-        self.sent_bytes += int(answer.request.headers.get("content-length", 0))
-        return answer
-
     def _headers(self) -> dict[str, str]:
         """Headers with a token, requested if missing by signing the centre's nonce."""
         if not self._token:
-            nonce = self.bare("/v1/token/nonce", {"robot": self._robot})["nonce"]
+            body = {"robot": self._robot}
+            nonce = _post(self._client, "/v1/token/nonce", body)["nonce"]
             signature = self._signer.sign(token_text(self._robot, nonce)).hex()
-            body = {"robot": self._robot, "nonce": nonce, "signature": signature}
-            self._token = self.bare("/v1/token", body)["token"]
+            body |= {"nonce": nonce, "signature": signature}
+            self._token = _post(self._client, "/v1/token", body)["token"]
         return {"Authorization": f"Bearer {self._token}"}
-
-    def bare(self, path: str, body: Any) -> Any:
-        """One request without a token."""
-        import httpx
-
-        try:
-            answer = self._client.post(path, json=body)
-        except httpx.HTTPError as error:
-            raise _out_of_reach(error) from error
-        self._refuse(answer)
-        return _content(answer)
 
     def _paced(self, pieces: Iterator[bytes]) -> Iterator[bytes]:
         for piece in pieces:
@@ -170,18 +160,31 @@ class Link:
         if self._bytes_per_s is not None:
             self._wait(size / self._bytes_per_s)
 
-    @staticmethod
-    def _refuse(answer: httpx.Response) -> None:
-        status = answer.status_code
-        if status < 400:
-            return
-        try:
-            detail = str(answer.json().get("detail", ""))
-        except (ValueError, AttributeError):
-            detail = answer.text[:200]
-        if status in {502, 503, 504}:
-            raise Unreachable(f"the centre is unavailable now (status {status}): {detail}")
-        raise CentreRefusedError(status, detail)
+
+def _post(client: httpx.Client, path: str, body: Any) -> Any:
+    """One request without a token."""
+    import httpx
+
+    try:
+        answer = client.post(path, json=body)
+    except httpx.HTTPError as error:
+        raise _out_of_reach(error) from error
+    _check(answer)
+    return _content(answer)
+
+
+def _check(answer: httpx.Response) -> None:
+    """Raises what an answer with a problem stands for."""
+    status = answer.status_code
+    if status < 400:
+        return
+    try:
+        detail = str(answer.json().get("detail", ""))
+    except (ValueError, AttributeError):
+        detail = answer.text[:200]
+    if status in {502, 503, 504}:
+        raise Unreachable(f"the centre is unavailable now (status {status}): {detail}")
+    raise CentreRefusedError(status, detail)
 
 
 def _out_of_reach(error: Exception) -> Unreachable:
@@ -206,7 +209,7 @@ def _content(answer: httpx.Response) -> Any:
         ) from error
 
 
-PARTS = ("live", "base", "next")
+FOLDERS = ("live", "base", "next")
 
 
 def enrol(folder: Path, url: str, code: str, name: str, client: httpx.Client | None = None) -> str:
@@ -224,8 +227,8 @@ def enrol(folder: Path, url: str, code: str, name: str, client: httpx.Client | N
     _check_centre(folder, url)
     key = folder / "key"
     try:
-        for part in PARTS:
-            (folder / part).mkdir(parents=True, exist_ok=True)
+        for kept in FOLDERS:
+            (folder / kept).mkdir(parents=True, exist_ok=True)
         if not key.exists():
             with write_whole(key) as draft:
                 draft.touch(mode=0o600)
@@ -234,14 +237,13 @@ def enrol(folder: Path, url: str, code: str, name: str, client: httpx.Client | N
         fact = f"{folder} cannot hold an agent: {error.strerror}"
         raise storage_full(error, folder) or InputError(fact) from error
     signer = signer_of(key)
-    link = Link(client or new_client(url), "", signer, None, lambda _: None)
     body = {
         "code": code,
         "name": name,
         "public_key": signer.public_key.hex(),
         "signature": signer.sign(enrolment_text(code)).hex(),
     }
-    answer = link.bare("/v1/robots/enrol", body)
+    answer = _post(client or new_client(url), "/v1/robots/enrol", body)
     state = AgentState(folder / "agent.sqlite")
     state.remember(url=url, robot=answer["robot"], map=answer["maps"][0], name=name)
     state.close()
@@ -271,7 +273,7 @@ def enrolled(folder: Path) -> AgentState:
     path = folder / "agent.sqlite"
     if path.exists():
         state = AgentState(path)
-        if state.fact("robot") is not None:
+        if state.facts.robot is not None:
             return state
         state.close()
     raise InputError(
@@ -286,9 +288,10 @@ def _check_centre(folder: Path, url: str) -> None:
     if not path.exists():
         return
     state = AgentState(path)
-    known, name = state.fact("url"), state.fact("name")
+    known = state.facts
     state.close()
-    if known is not None and known.rstrip("/") != url:
+    if known.url is not None and known.url.rstrip("/") != url:
         raise InputError(
-            f"{folder} belongs to the robot {name!r} of {known}; give another folder for {url}"
+            f"{folder} belongs to the robot {known.name!r} of {known.url}; give another folder for "
+            f"{url}"
         )
