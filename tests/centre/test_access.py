@@ -339,7 +339,7 @@ def test_a_service_ends_although_somebody_follows_its_events(site, monkeypatch):
             await super().startup(sockets=sockets)
             started.put((self, sockets[0].getsockname()[1]))
 
-    monkeypatch.setattr(serving, "_telling", lambda _: Told)
+    monkeypatch.setattr(serving, "_announcing", lambda _: Told)
     monkeypatch.setattr(serving, "_GRACE_S", 0)
     given = (site.centre, Listening("127.0.0.1", 0))
     service = threading.Thread(target=serve, args=given, kwargs={"worker": False}, daemon=True)

@@ -92,9 +92,9 @@ def serve(centre: Centre, listening: Listening, *, worker: bool = True) -> None:
     except OSError as error:  # SSL's, too
         files = f"{listening.certificate} and {listening.key}"
         raise InputError(f"TLS cannot be had with {files}: {error.strerror or error}") from error
-    server = _telling(uvicorn.Server)(config)
-    beside = _supervised_worker(centre) if worker else nullcontext()
-    with _listening_at(listening) as taken, beside:
+    server = _announcing(uvicorn.Server)(config)
+    supervised = _supervised_worker(centre) if worker else nullcontext()
+    with _listening_at(listening) as taken, supervised:
         server.run(sockets=[taken])
 
 
@@ -116,10 +116,10 @@ def _listening_at(listening: Listening) -> socket.socket:
         raise InputError(f"cannot listen at {where}: {fact}; {cure}") from error
 
 
-def _telling(kind: type[Any]) -> type[Any]:
+def _announcing(kind: type[Any]) -> type[Any]:
     """A server that prints its address as soon as it answers."""
 
-    class Telling(kind):  # type: ignore[misc]
+    class Announcing(kind):  # type: ignore[misc]
         async def startup(self, sockets: Any = None) -> None:
             await super().startup(sockets=sockets)
             if self.started:
@@ -127,7 +127,7 @@ def _telling(kind: type[Any]) -> type[Any]:
                 host, port = self.config.host, sockets[0].getsockname()[1]
                 print(f"engram centre at {scheme}://{host}:{port}", flush=True)
 
-    return Telling
+    return Announcing
 
 
 def run_worker(
@@ -152,7 +152,7 @@ def _supervised_worker(centre: Centre) -> Iterator[None]:
 
     def keep() -> None:
         while not stop.is_set():
-            process = context.Process(target=_work_beside, args=(centre.folder, *centre.addresses))
+            process = context.Process(target=_child_work, args=(centre.folder, *centre.addresses))
             process.start()
             while process.is_alive() and not stop.wait(_RESTART_S):
                 pass
@@ -170,7 +170,7 @@ def _supervised_worker(centre: Centre) -> Iterator[None]:
         thread.join()
 
 
-def _work_beside(folder: Path, database: str | None, objects: str | None) -> None:
+def _child_work(folder: Path, database: str | None, objects: str | None) -> None:
     """Main function of the worker that runs with the service."""
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service ends it
