@@ -44,7 +44,7 @@ CREATE TABLE IF NOT EXISTS arrived (hash BLOB PRIMARY KEY, body BLOB NOT NULL) S
 
 @dataclass(frozen=True, slots=True)
 class AgentFacts:
-    """What an agent knows of its robot; None where it does not know yet.
+    """What an agent remembers of its robot; None where nothing is recorded yet.
 
     Attributes:
         url, robot, map, name: the centre, the robot's id there, its map, and its own name.
@@ -147,7 +147,7 @@ class AgentState:
 
     @property
     def facts(self) -> AgentFacts:
-        """What the agent knows now: other processes of the robot write it, too."""
+        """The facts as of now: other processes of the robot change them, too."""
         rows = self._rows("SELECT name, value FROM facts")
         try:
             return msgspec.convert({name: json.loads(value) for name, value in rows}, AgentFacts)
