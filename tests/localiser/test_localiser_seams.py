@@ -9,7 +9,7 @@ from tests.mapping_rig import localised, map_simulated
 from tests.synthetic_world import PERIOD_NS, Seen, World, drive
 
 from engram.errors import MapCorruptError
-from engram.localiser.attempts import FrameMatcher
+from engram.localiser.attempts import Lanes, one_by_one
 from engram.localiser.localisation import Budget, LocalisationStatus, Position
 from engram.maps.map import Map
 from engram.odometry.step import OdometryStatus, OdometryStep
@@ -23,10 +23,11 @@ WORLD = World(30.0)
 ROAD = np.arange(0.0, 25.0, 0.7)
 
 
-class _Counting(FrameMatcher):
+class _Counting(Lanes):
     """Matches as a robot does, and counts."""
 
     calls = 0
+    matches = one_by_one
 
     def match(self, live, live_id, node, guide):
         self.calls += 1
@@ -150,8 +151,10 @@ def test_what_is_foreseen_is_what_attempts_come_to(tmp_path: Path, monkeypatch) 
     assert policy.seen[-1][0].accepted.any()
 
 
-class _Damaged(FrameMatcher):
+class _Damaged(Lanes):
     """The landmarks of the map's first node cannot be read."""
+
+    matches = one_by_one
 
     def __init__(self, opened: Map) -> None:
         super().__init__(opened.frames, Settings().localiser.matcher)

@@ -14,7 +14,7 @@ from engram.frontend.matching import Match
 from engram.geometry.se3 import SE3
 from engram.graph.model import NodeId
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, Rule, Spread
-from engram.localiser.attempts import Attempter, Candidate, Outcome
+from engram.localiser.attempts import Attempter, Candidate, Outcome, one_by_one
 from engram.localiser.confidence import Standing, confidence_of
 from engram.localiser.settings import LocaliserConfig
 
@@ -30,6 +30,8 @@ class Matches:
     def __init__(self, inliers: int, extent: Spread) -> None:
         self._inliers, self._extent = inliers, extent
         self.asked = 0
+
+    matches = one_by_one
 
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
         rows = np.arange(self._inliers, dtype=np.int32)

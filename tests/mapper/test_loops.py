@@ -12,7 +12,7 @@ from tests.synthetic_world import World, drive, see
 from engram.errors import MapCorruptError
 from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind
-from engram.localiser.attempts import FrameMatcher
+from engram.maps.frame_reader import FrameReader
 from engram.maps.map import Map
 
 # A lap of 151 m with a step every 0.7 m: 0.17° a step too much is 37° and 17 m at its end.
@@ -110,14 +110,14 @@ def test_a_place_that_looks_like_another_one_closes_no_loop(path: Path, alike_m:
 
 
 def test_places_that_cannot_be_read_close_no_loop(path: Path, monkeypatch) -> None:
-    readable = FrameMatcher.match
+    readable = FrameReader.frame
 
-    def match(self, live, live_id, node, guide):
+    def frame(self, node):
         if threading.current_thread().name.startswith("engram-loops"):
             raise MapCorruptError(f"node {node}: does not match its checksum")
-        return readable(self, live, live_id, node, guide)
+        return readable(self, node)
 
-    monkeypatch.setattr(FrameMatcher, "match", match)
+    monkeypatch.setattr(FrameReader, "frame", frame)
     places = np.arange(0.0, LAP_M + 20.0, 0.7)
     mapped = map_simulated(path, drive(RING, places, drift=DRIFT), closes_loops=True)
     assert len(mapped.steps) == len(places)

@@ -16,7 +16,7 @@ from engram.frontend.matching import NO_MATCH, Match
 from engram.geometry.se3 import SE3
 from engram.graph.model import Attempt, NodeId, PathEntry, Session, path_id
 from engram.localiser.acceptance import Prediction, Spread
-from engram.localiser.attempts import FrameMatcher
+from engram.localiser.attempts import Lanes, one_by_one
 from engram.localiser.localisation import Position
 from engram.localiser.localiser import Localiser
 from engram.mapper.mapper import Mapper, Memory, Records, Saver
@@ -38,8 +38,10 @@ MIRAGE = 10
 class Mirage:
     """Matches as usual, but for some frames only a look-alike, with few inliers."""
 
+    matches = one_by_one
+
     def __init__(self, opened: Map, node: NodeId, stamps_ns: set[int]) -> None:
-        self._usual = FrameMatcher(opened.frames, Settings().localiser.matcher)
+        self._usual = Lanes(opened.frames, Settings().localiser.matcher)
         self._node, self._stamps_ns = node, stamps_ns
 
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:

@@ -15,7 +15,7 @@ from engram.graph.model import PathEntry, PathEntryKind, path_id
 from engram.graph.paths import Attempts, PathMemory
 from engram.ranking.context import UNKNOWN_BASE, Lessons
 from engram.ranking.recall import RECALL, RecallPolicy
-from engram.ranking.recent import RunLog
+from engram.ranking.recent import AttemptHistory
 from engram.testing.contracts import (
     flat_graph,
     lessons_of,
@@ -216,16 +216,17 @@ class TestPicking:
         self, step_m: float, inliers: int, aside_m: float
     ) -> None:
         """The nearest node's drive falls short of 20 inliers each time, the other's would match."""
-        log, driven_m, tried = RunLog(), 0.0, []
+        history, driven_m, tried = AttemptHistory(), 0.0, []
         for _ in range(30):
+            history.begin_frame(driven_m)
             context = make_context(candidates=[0, 1], along_m=[0.0, aside_m], sessions=2)
-            context = dataclasses.replace(context, run=log.attempts(driven_m))
+            context = dataclasses.replace(context, run=history.run())
             pick = int(context.neighbourhood.nodes[RecallPolicy().rank(context)[0]])
             matched = pick == 1
             rates = context.success_rates()[[pick]]
             away_m = context.neighbourhood.rms_distance_m[[pick]]
             count = 40 if matched else inliers
-            log.add(driven_m, [pick], (away_m, rates), [matched], [count], 300)
+            history.add([pick], (away_m, rates), [matched], [count], 300)
             tried.append(pick)
             driven_m += step_m
         # Once found, what matches is not left again.
@@ -246,21 +247,22 @@ class TestPicking:
         self, lanes: int, elsewhere: int, sigma_m: float, all_are_tried: bool
     ) -> None:
         """Thirty nodes over 29 m, of which none matches; as many picks of each kind."""
-        count, log, driven_m = 30, RunLog(), 0.0
+        count, history, driven_m = 30, AttemptHistory(), 0.0
         tried: set[int] = set()
         for _ in range(2 * count // lanes + 2):
+            history.begin_frame(driven_m)
             context = make_context(
                 candidates=range(count), along_m=np.arange(float(count)), sessions=3
             )
             near = dataclasses.replace(context.neighbourhood, sigma_m=np.full(count, sigma_m))
-            context = dataclasses.replace(context, neighbourhood=near, run=log.attempts(driven_m))
+            context = dataclasses.replace(context, neighbourhood=near, run=history.run())
             picks = nodes_of(context)
             assert sorted(picks) == list(range(count))
             tried |= set(picks[:lanes])
             nodes = [*picks[:lanes], *(number % count for number in range(elsewhere))]
             rates = np.r_[np.full(lanes, 0.9), np.full(elsewhere, np.nan)]
             failed = [False] * len(nodes)
-            log.add(driven_m, nodes, (5 * (1 - rates), rates), failed, [0] * len(nodes), 300)
+            history.add(nodes, (5 * (1 - rates), rates), failed, [0] * len(nodes), 300)
             driven_m += 0.7
         assert (tried == set(range(count))) is all_are_tried
 

@@ -101,7 +101,7 @@ def test_four_hops_from_the_loop_to_the_kernel(
     assert len(attempts) > 5
     for stack in attempts:
         # The kernel itself is the fourth hop; lambdas and wrappers would stand between.
-        assert stack == ["drive", "step", "localise", "attempts", "match"]
+        assert stack == ["drive", "step", "localise", "attempts", "matches"]
 
 
 def test_a_frame_stamped_too_early_is_left_out_and_reported(localiser: Localiser) -> None:

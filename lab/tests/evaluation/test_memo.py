@@ -9,7 +9,7 @@ from tests.synthetic_world import World, drive
 
 from engram.frontend.matching import MatcherConfig
 from engram.graph.model import NodeId, SessionId, node_id
-from engram.localiser.attempts import FrameMatcher
+from engram.localiser.attempts import Lanes
 from engram_lab.studies.lockstep import MatchMemo
 
 WORLD = World(20.0)
@@ -43,7 +43,7 @@ def live_frames():
 
 
 def memo_of(frames: Frames, path: Path, matcher_hash: str = "a") -> MatchMemo:
-    return MatchMemo(FrameMatcher(frames, CONFIG), path, matcher_hash)
+    return MatchMemo(Lanes(frames, CONFIG), path, matcher_hash)
 
 
 def everything(matcher, frames: Frames) -> list:
@@ -65,7 +65,7 @@ def assert_same(found, wanted) -> None:
 
 
 def test_what_is_kept_is_to_the_bit_what_would_be_made(frames: Frames, tmp_path: Path) -> None:
-    wanted = everything(FrameMatcher(frames, CONFIG), frames)
+    wanted = everything(Lanes(frames, CONFIG), frames)
     assert any(one.inliers > 20 for one in wanted)
     assert any(one.inliers == 0 for one in wanted)
     memo = memo_of(frames, tmp_path / "memo.npz")
@@ -100,11 +100,11 @@ def test_a_memo_that_does_not_fit_counts_as_empty(
         path.write_bytes(b"nothing of the kind")
     again = memo_of(frames, path, "b" if damage == "other matcher" else "a")
     assert again.known == 0
-    assert_same(everything(again, frames), everything(FrameMatcher(frames, CONFIG), frames))
+    assert_same(everything(again, frames), everything(Lanes(frames, CONFIG), frames))
 
 
 def test_the_spread_of_inliers_is_known_too(frames: Frames, tmp_path: Path) -> None:
-    matcher, memo = FrameMatcher(frames, CONFIG), memo_of(frames, tmp_path / "memo.npz")
+    matcher, memo = Lanes(frames, CONFIG), memo_of(frames, tmp_path / "memo.npz")
     live, node = live_frames()[0], next(iter(frames.nodes))
     live_id = node_id(LIVE, live.stamp_ns)
     match = matcher.match(live, live_id, node, None)

@@ -19,7 +19,7 @@ from engram.config import config_hash, from_dict
 from engram.errors import ConfigError
 from engram.graph.paths import MATCHES_ONLY
 from engram.localiser import localiser
-from engram.localiser.attempts import FrameMatcher
+from engram.localiser.attempts import Lanes, one_by_one
 from engram.maps.map import open_map
 from engram.monitor import QUIET
 from engram.ranking.policies import POLICIES
@@ -224,8 +224,9 @@ def test_where_the_first_success_counts_all_attempts_and_candidates_do(plan: Pla
 def test_attempts_beside_the_first_success_were_made(plan: Plan) -> None:
     fold, drive = held_out(plan)
 
-    class Counting(FrameMatcher):
+    class Counting(Lanes):
         calls = 0
+        matches = one_by_one
 
         def match(self, *arguments):
             self.calls += 1
@@ -311,7 +312,7 @@ def test_a_held_out_drive_has_every_setting(usual: Plan, table: str) -> None:
     drive = usual.drives.drives[fold.held_out[0]]
     frames = drive.frames()[:1]
     with open_map(usual.map_path(fold)) as opened:
-        memo = FrameMatcher(opened.frames, usual.settings.localiser.matcher)
+        memo = Lanes(opened.frames, usual.settings.localiser.matcher)
         for key in of(table):
             settings, value = altered(key, EVERY[key])
             for matcher in (None, memo):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated
@@ -186,26 +185,6 @@ class Question:
     predicted_covariance: NDArray[np.float64] | None = None
 
 
-class Lanes:
-    """Matches a live frame with several others at once, on threads of the core.
-
-    Args:
-        count: of the lanes; the first is the thread of the caller.
-    """
-
-    def __init__(self, count: int = 1) -> None:
-        self._threads = _core.WorkThreads(count - 1)
-
-    def match(self, live: Frame, questions: Sequence[Question]) -> list[Match]:
-        """The match of each; see `match_frames`."""
-        asked = [_arguments(question, live) for question in questions]
-        return [_match(found) for found in _core.attempt(features(live), asked, self._threads)]
-
-    def close(self) -> None:
-        """Ends the threads; later matches are made on the caller's."""
-        self._threads = _core.WorkThreads(0)
-
-
 def match_frames(
     reference: Frame,
     live: Frame,
@@ -227,10 +206,15 @@ def match_frames(
     Source: method §2.4–2.6.
     """
     question = Question(reference, config, seed, predicted, predicted_covariance)
-    return _match(_core.attempt(features(live), [_arguments(question, live)])[0])
+    return match_of(_core.attempt(features(live), [arguments(question, live)])[0])
 
 
-def _arguments(asked: Question, live: Frame) -> _core.AttemptArguments:
+def arguments(asked: Question, live: Frame) -> _core.AttemptArguments:
+    """A question in the form of the kernels.
+
+    Raises:
+        IncompatibleError, InputError: as `match_frames`.
+    """
     check_same_kind(asked.reference, live)
     predicted, covariance = asked.predicted, asked.predicted_covariance
     if (predicted is None) != (covariance is None):
@@ -244,7 +228,8 @@ def _arguments(asked: Question, live: Frame) -> _core.AttemptArguments:
     )
 
 
-def _match(found: _core.PoseAndInliers | None) -> Match:
+def match_of(found: _core.PoseAndInliers | None) -> Match:
+    """The match that the kernels found."""
     if found is None:
         return NO_MATCH
     matrix, covariance, reference_rows, live_rows = found

@@ -11,15 +11,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from engram import _core
 from engram.errors import MapCorruptError
 from engram.frontend.frame import Frame
 from engram.frontend.matching import (
     NO_MATCH,
-    Lanes,
     Match,
     MatcherConfig,
     Question,
+    arguments,
+    features,
     match_frames,
+    match_of,
     pair_seed,
 )
 from engram.geometry.se3 import SE3
@@ -42,7 +45,7 @@ from engram.localiser.acceptance import (
 from engram.localiser.confidence import UNKNOWN, Evidence, Standing, confidence_of
 from engram.localiser.localisation import Position
 from engram.localiser.settings import LocaliserConfig
-from engram.ranking.recent import Observations, RecentAttempts, RecentConfig, RunAttempts, RunLog
+from engram.ranking.recent import AttemptHistory
 
 # Matches of fewer inliers are wrong or useless; their spread is not worth computing.
 _LEAST_WEIGHED = 12
@@ -72,6 +75,11 @@ class Candidate:
     doubted: bool = False
     standing: Standing = UNKNOWN
     lost_long: bool = False
+
+    @property
+    def guide(self) -> Prediction | None:
+        """The prediction, if it guides the matching."""
+        return self.prediction if self.guided else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +119,17 @@ class Matcher(Protocol):
     """The first half of an attempt, a pure function of two frames (method §3.2)."""
 
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
-        """The match of a live frame with a node; `guide` is given for a guided attempt only."""
+        """The match of a live frame with a node; `guide` is given for a guided attempt only.
+
+        Raises:
+            MapCorruptError: the node's landmarks are damaged.
+        """
+        ...
+
+    def matches(
+        self, live: Frame, live_id: NodeId, candidates: Sequence[Candidate]
+    ) -> list[Match | None]:
+        """The matches with some candidates, None where a node is damaged; see `one_by_one`."""
         ...
 
     def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
@@ -123,22 +141,56 @@ class Matcher(Protocol):
         ...
 
 
-class FrameMatcher:
-    """Matches with the landmarks that a source holds, as an `Attempter` without a matcher does.
+def one_by_one(
+    matcher: Matcher, live: Frame, live_id: NodeId, candidates: Sequence[Candidate]
+) -> list[Match | None]:
+    """`Matcher.matches` by its `match`."""
+    found: list[Match | None] = []
+    for candidate in candidates:
+        try:
+            found.append(matcher.match(live, live_id, candidate.node, candidate.guide))
+        except MapCorruptError:
+            found.append(None)
+    return found
+
+
+class Lanes:
+    """Matches with the landmarks that a source holds, several at once, on threads of the core.
+
+    Matches are seeded by the UUIDs of both frames.
 
     Args:
         frames: the landmarks.
         config: settings.
+        lost_config: settings where nothing is predicted; None for the same.
+        count: number of lanes; the first is the thread of the caller.
     """
 
-    def __init__(self, frames: LandmarkSource, config: MatcherConfig) -> None:
+    def __init__(
+        self,
+        frames: LandmarkSource,
+        config: MatcherConfig,
+        lost_config: MatcherConfig | None = None,
+        count: int = 1,
+    ) -> None:
         self._frames = frames
         self._config = config
+        self._lost_config = lost_config or config
+        self._threads = _core.WorkThreads(count - 1)
 
     def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
-        """See `Matcher`; seeded by both UUIDs."""
+        """See `Matcher`."""
         seed = pair_seed(live_id, node)
         return match_frames(self._frames.frame(node), live, self._config, seed, *_expected(guide))
+
+    def matches(
+        self, live: Frame, live_id: NodeId, candidates: Sequence[Candidate]
+    ) -> list[Match | None]:
+        """See `Matcher`."""
+        questions = [self._question(live_id, candidate) for candidate in candidates]
+        asked = [arguments(one, live) for one in questions if one is not None]
+        found = iter(_core.attempt(features(live), asked, self._threads))
+        return [None if one is None else match_of(next(found)) for one in questions]
 
     def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
         """See `Matcher`."""
@@ -149,6 +201,20 @@ class FrameMatcher:
         """See `Matcher`."""
         self._frames.prefetch(nodes)
 
+    def close(self) -> None:
+        """Ends the threads; later matches are made on the caller's."""
+        self._threads = _core.WorkThreads(0)
+
+    def _question(self, live_id: NodeId, candidate: Candidate) -> Question | None:
+        """What the live frame is matched with; None if the node is damaged."""
+        config = self._lost_config if candidate.prediction is None else self._config
+        try:
+            reference = self._frames.frame(candidate.node)
+        except MapCorruptError:
+            return None
+        seed = pair_seed(live_id, candidate.node)
+        return Question(reference, config, seed, *_expected(candidate.guide))
+
 
 class Attempter:
     """Makes attempts: matches the live frame with nodes, and judges the matches.
@@ -156,7 +222,7 @@ class Attempter:
     Args:
         frames: where the landmarks of nodes come from.
         config: settings of both halves.
-        matcher: the first half, for studies that keep matches; None matches with `frames`.
+        matcher: the first half, for studies that keep matches; None for the landmarks of `frames`.
         lanes: how many matches with `frames` are made at once.
     """
 
@@ -167,13 +233,11 @@ class Attempter:
         matcher: Matcher | None = None,
         lanes: int = 1,
     ) -> None:
-        self._lanes = Lanes(lanes)
+        self._lanes = Lanes(frames, config.matcher, config.lost_matcher, lanes)
+        self._matcher = self._lanes if matcher is None else matcher
         self._frames = frames
-        self._config = config.matcher
-        self._lost_config = config.lost_matcher
         self._acceptance = config.acceptance
         self._narrow = config.narrow_m, config.narrow_rad
-        self._matcher = matcher
 
     def close(self) -> None:
         """Ends the threads of the lanes."""
@@ -181,7 +245,7 @@ class Attempter:
 
     def prefetch(self, nodes: list[NodeId]) -> None:
         """Announces the nodes likely to be attempted next."""
-        (self._frames if self._matcher is None else self._matcher).prefetch(nodes)
+        self._matcher.prefetch(nodes)
 
     def frame(self, node: NodeId) -> Frame | None:
         """The frame that was saved as a node; None if it is damaged."""
@@ -208,13 +272,7 @@ class Attempter:
             rank: place of the first candidate in the order.
             candidates: what to attempt.
         """
-        matches: list[Match | None]
-        if self._matcher is None:
-            questions = [self._question(live_id, candidate) for candidate in candidates]
-            found = iter(self._lanes.match(live, [one for one in questions if one is not None]))
-            matches = [None if one is None else next(found) for one in questions]
-        else:
-            matches = [self._of_matcher(live, live_id, candidate) for candidate in candidates]
+        matches = self._matcher.matches(live, live_id, candidates)
         best = [
             self._sought_closely(live, live_id, candidate, match)
             for candidate, match in zip(candidates, matches, strict=True)
@@ -246,7 +304,8 @@ class Attempter:
         if not weak and far_m <= acceptance.slack_m:
             return match
         narrow = Prediction(prediction.node_from_live, *self._narrow)
-        closer = self._matched(live, live_id, replace(candidate, prediction=narrow, guided=True))
+        near = replace(candidate, prediction=narrow, guided=True)
+        (closer,) = self._matcher.matches(live, live_id, [near])
         if closer is None or closer.reference_from_live is None or closer.inliers < match.inliers:
             return match
         if weak:
@@ -255,32 +314,6 @@ class Attempter:
         its_m = _apart_m(closer.reference_from_live, prediction.node_from_live)
         return closer if its_m < far_m else match
 
-    def _matched(self, live: Frame, live_id: NodeId, candidate: Candidate) -> Match | None:
-        """One more match; None if the node is damaged."""
-        if self._matcher is not None:
-            return self._of_matcher(live, live_id, candidate)
-        question = self._question(live_id, candidate)
-        return None if question is None else self._lanes.match(live, [question])[0]
-
-    def _question(self, live_id: NodeId, candidate: Candidate) -> Question | None:
-        """What the live frame is matched with; None if the node is damaged."""
-        config = self._lost_config if candidate.prediction is None else self._config
-        reference = self.frame(candidate.node)
-        if reference is None:
-            return None
-        guide = candidate.prediction if candidate.guided else None
-        seed = pair_seed(live_id, candidate.node)
-        return Question(reference, config, seed, *_expected(guide))
-
-    def _of_matcher(self, live: Frame, live_id: NodeId, candidate: Candidate) -> Match | None:
-        """The matcher's match; None if the node is damaged."""
-        assert self._matcher is not None
-        guide = candidate.prediction if candidate.guided else None
-        try:
-            return self._matcher.match(live, live_id, candidate.node, guide)
-        except MapCorruptError:
-            return None
-
     def _judged(
         self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate, match: Match | None
     ) -> Outcome:
@@ -288,7 +321,7 @@ class Attempter:
             return Outcome(candidate, rank, NO_MATCH, accepted=False, damaged=True)
         if match.reference_from_live is None:
             return Outcome(candidate, rank, match, accepted=False)
-        spread = partial(self._spread, live, live_id, candidate.node, match)
+        spread = partial(self._matcher.spread, live, live_id, candidate.node, match)
         evidence = self._evidence(live, candidate, match, spread)
         model = confidence_of(live.descriptor)
         anywhere = candidate.prediction is None or candidate.doubted
@@ -368,13 +401,8 @@ class Attempter:
         match = outcome.match
         if len(match.live_rows) == match.inliers:
             return match
-        question = self._question(live_id, outcome.candidate)
-        return match if question is None else self._lanes.match(live, [question])[0]
-
-    def _spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
-        if self._matcher is None:
-            return inlier_spread(match, self._frames.frame(node), live)
-        return self._matcher.spread(live, live_id, node, match)
+        (found,) = self._lanes.matches(live, live_id, [outcome.candidate])
+        return found or match
 
 
 def _expected(guide: Prediction | None) -> tuple[SE3 | None, NDArray[np.float64] | None]:
@@ -458,129 +486,88 @@ def outcome_at(outcomes: Sequence[Outcome], node: NodeId | None) -> Outcome | No
     return next((one for one in outcomes if one.accepted and one.candidate.node == node), None)
 
 
-class Tried:
-    """The attempts of the last iterations, and those of the drive with where they were made.
+def add_outcomes(
+    history: AttemptHistory,
+    live: Frame,
+    near: Neighbourhood | None,
+    outcomes: Sequence[Outcome],
+    basin: MatchBasin,
+    lenses: Lenses,
+) -> None:
+    """Adds the outcomes of one frame to the history of its drive.
 
     Args:
-        config: how far back the last iterations reach.
+        history: grows.
+        live: the frame.
+        near: the neighbourhood of its predicted candidates.
+        outcomes: of all its attempts.
         basin: of the live camera.
         lenses: of the map's drives.
     """
+    history.add(
+        [one.candidate.index for one in outcomes],
+        _foreseen(near, outcomes, basin, lenses),
+        [one.accepted for one in outcomes],
+        [one.match.inliers for one in outcomes],
+        len(live.landmarks),
+    )
 
-    def __init__(self, config: RecentConfig, basin: MatchBasin, lenses: Lenses) -> None:
-        self._config = config
-        self._basin = basin
-        self._lenses = lenses
-        self._recent = RecentAttempts(config)
-        self._run = RunLog()
 
-    @property
-    def config(self) -> RecentConfig:
-        """How far back the last iterations reach."""
-        return self._config
+def stored_attempts(
+    iteration: int,
+    near: Neighbourhood,
+    reference: NodeId,
+    outcomes: Sequence[Outcome],
+    policy: str,
+) -> list[Attempt]:
+    """The attempts of one iteration that had a prediction, as a map stores them (method §3.5).
 
-    @property
-    def iteration(self) -> int:
-        """Number of the current iteration."""
-        return self._recent.iteration
-
-    @property
-    def observations(self) -> Observations:
-        """The attempts of the last iterations."""
-        return self._recent.observations
-
-    def run(self, driven_m: float) -> RunAttempts:
-        """The attempts of the drive that are remembered after `driven_m` metres."""
-        return self._run.attempts(driven_m)
-
-    def resume(self, next_iteration: int) -> None:
-        """Continues with this iteration, without the last ones."""
-        self._recent = RecentAttempts(self._config, next_iteration)
-
-    def begin_frame(self, driven_m: float) -> None:
-        """Begins a frame at this distance driven, metres."""
-        self._recent.begin_frame(driven_m)
-
-    def add(
-        self,
-        live: Frame,
-        driven_m: float,
-        near: Neighbourhood | None,
-        outcomes: Sequence[Outcome],
-    ) -> None:
-        """Adds the outcomes of one frame.
-
-        Args:
-            live: the frame.
-            driven_m: odometry distance from the session's start, metres.
-            near: the neighbourhood of its predicted candidates.
-            outcomes: of all its attempts.
-        """
-        # A lost robot's failed proposals tell nothing of the appearance here: they are elsewhere.
-        here = [one for one in outcomes if one.candidate.row is not None or one.accepted]
-        self._recent.add([one.candidate.index for one in here], [one.accepted for one in here])
-        self._run.add(
-            driven_m,
-            [one.candidate.index for one in outcomes],
-            self._expected(near, outcomes),
-            [one.accepted for one in outcomes],
-            [one.match.inliers for one in outcomes],
-            len(live.landmarks),
+    Args:
+        iteration: its number.
+        near: the neighbourhood of the candidates.
+        reference: node that the position referred to.
+        outcomes: of all attempts.
+        policy: name of the policy that ordered them.
+    """
+    return [
+        Attempt(
+            iteration=iteration,
+            reference=reference,
+            node=outcome.candidate.node,
+            along_m=float(near.along_m[row]),
+            across_m=float(near.across_m[row]),
+            yaw_rad=float(near.yaw_rad[row]),
+            sigma_m=float(near.sigma_m[row]),
+            sigma_yaw_rad=float(near.sigma_yaw_rad[row]),
+            accepted=outcome.accepted,
+            inliers=outcome.match.inliers,
+            rank=outcome.rank,
+            policy=policy,
         )
+        for outcome in outcomes
+        if (row := outcome.candidate.row) is not None
+    ]
 
-    def stored(
-        self,
-        near: Neighbourhood,
-        reference: NodeId,
-        outcomes: Sequence[Outcome],
-        policy: str,
-    ) -> list[Attempt]:
-        """The attempts of the current iteration that had a prediction, as a map stores them.
 
-        Args:
-            near: the neighbourhood of the candidates.
-            reference: node that the position referred to.
-            outcomes: of all attempts.
-            policy: name of the policy that ordered them.
-        """
-        return [
-            Attempt(
-                iteration=self.iteration,
-                reference=reference,
-                node=outcome.candidate.node,
-                along_m=float(near.along_m[row]),
-                across_m=float(near.across_m[row]),
-                yaw_rad=float(near.yaw_rad[row]),
-                sigma_m=float(near.sigma_m[row]),
-                sigma_yaw_rad=float(near.sigma_yaw_rad[row]),
-                accepted=outcome.accepted,
-                inliers=outcome.match.inliers,
-                rank=outcome.rank,
-                policy=policy,
-            )
-            for outcome in outcomes
-            if (row := outcome.candidate.row) is not None
-        ]
-
-    def _expected(
-        self, near: Neighbourhood | None, outcomes: Sequence[Outcome]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(R,) distances, metres, and rates of success of attempts; NaN without a prediction."""
-        distance_m, rates = np.full((2, len(outcomes)), np.nan)
-        predicted = [one.candidate.row for one in outcomes]
-        known = [at for at, row in enumerate(predicted) if row is not None]
-        if near is None or not known:
-            return distance_m, rates
-        rows = [row for row in predicted if row is not None]
-        seen = self._lenses.as_seen(near)
-        distance_m[known] = np.hypot(seen.distance_m[rows], seen.sigma_m[rows])
-        rates[known] = self._basin.success_rate(seen.along_m[rows], seen.across_m[rows])
-        for at, row in zip(known, rows, strict=True):
-            found = outcomes[at].match.reference_from_live
-            if outcomes[at].accepted and found is not None:
-                from_node_m = found.translation
-                if seen is not near:
-                    shift_m = self._lenses.shifts_m(near.nodes[[row]])
-                    from_node_m = from_node_m - np.array([0.0, 0.0, *shift_m])
-                distance_m[at] = math.sqrt(from_node_m @ from_node_m)
+def _foreseen(
+    near: Neighbourhood | None, outcomes: Sequence[Outcome], basin: MatchBasin, lenses: Lenses
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(R,) distances, metres, and rates of success of attempts; NaN without a prediction."""
+    distance_m, rates = np.full((2, len(outcomes)), np.nan)
+    predicted = [one.candidate.row for one in outcomes]
+    known = [at for at, row in enumerate(predicted) if row is not None]
+    if near is None or not known:
         return distance_m, rates
+    rows = [row for row in predicted if row is not None]
+    seen = lenses.as_seen(near)
+    distance_m[known] = np.hypot(seen.distance_m[rows], seen.sigma_m[rows])
+    rates[known] = basin.success_rate(seen.along_m[rows], seen.across_m[rows])
+    for at, row in zip(known, rows, strict=True):
+        pose = outcomes[at].match.reference_from_live
+        if outcomes[at].accepted and pose is not None:
+            from_node_m = pose.translation
+            if seen is not near:
+                shift_m = lenses.shifts_m(near.nodes[[row]])
+                from_node_m = from_node_m - np.array([0.0, 0.0, *shift_m])
+            distance_m[at] = math.sqrt(from_node_m @ from_node_m)
+    return distance_m, rates

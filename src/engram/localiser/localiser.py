@@ -36,10 +36,11 @@ from engram.localiser.attempts import (
     Candidate,
     Matcher,
     Outcome,
-    Tried,
+    add_outcomes,
     alternate,
     best_success,
     split_at_first_success,
+    stored_attempts,
     uncontested,
 )
 from engram.localiser.confidence import confidence_of
@@ -60,6 +61,7 @@ from engram.odometry.motion import UNMOVED, Motion
 from engram.odometry.step import OdometryStatus
 from engram.processes import cores
 from engram.ranking.context import Background, Foreseen, RankingContext, RankingPolicy
+from engram.ranking.recent import AttemptHistory
 
 # For a drive without an id: equal input still gives equal results.
 UNNAMED_LIVE_SESSION = SessionId(uuid5(ENGRAM_NAMESPACE, "live"))
@@ -184,7 +186,7 @@ class Localiser:
             self.config.hypotheses,
         )
         self._lenses = self._lenses_of_map()
-        self._tried = Tried(self.config.recent, drive.basin, self._lenses)
+        self._history = AttemptHistory(self.config.recent)
         # The published rule knows no more than the last match.
         once = self.config.acceptance.rule is Rule.INLIERS
         self._track = Track(known.graph, 0.0 if once else self.config.earlier_doubt)
@@ -260,7 +262,7 @@ class Localiser:
             self.config,
             neighbourhood=self._searched_by(),
             path_entries=PathEntries.of(self._paths.kinds),
-            recent=self._tried.config,
+            recent=self._history.config,
         )
         return InForce(self._policy.name, self._budget, found)
 
@@ -280,7 +282,9 @@ class Localiser:
         """The last frame's attempts that had a prediction, as a map stores them (method §3.5)."""
         if self._near is None or self._reference is None:
             return []
-        return self._tried.stored(self._near, self._reference, self._outcomes, self._policy.name)
+        return stored_attempts(
+            self.iteration, self._near, self._reference, self._outcomes, self._policy.name
+        )
 
     def place_at(
         self,
@@ -347,12 +351,12 @@ class Localiser:
             next_iteration: number of the first iteration.
         """
         self._driven_m = driven_m
-        self._tried.resume(next_iteration)
+        self._history.resume(next_iteration)
 
     @property
     def iteration(self) -> int:
         """Number of the current iteration."""
-        return self._tried.iteration
+        return self._history.iteration
 
     def settle_in(self, node: NodeId) -> None:
         """Sets the position to `node`, as which the live frame was just saved (method §4)."""
@@ -380,7 +384,7 @@ class Localiser:
         """
         clock = clock or StageClock()
         self._new_damaged, self._near, self._looked_up, self._beyond = (), None, False, []
-        self._tried.begin_frame(self._driven_m)
+        self._history.begin_frame(self._driven_m)
         self._prover.begin_frame(self._motion.odometry.inliers)
         outcomes: list[Outcome] = []
         if live.status is FrameStatus.OK:
@@ -402,7 +406,7 @@ class Localiser:
                 self._beyond = [one for one in beyond if not one.damaged]
             outcomes = self._believed(live, self._judged(live, outcomes))
             clock.lap("attempts")
-            self._tried.add(live, self._driven_m, self._near, outcomes)
+            add_outcomes(self._history, live, self._near, outcomes, self._basin, self._lenses)
         success = self._conclude(live, outcomes, keeper.alone_m())
         clock.lap("remember")
         return self._result(live, success, clock.stage_ms)
@@ -512,13 +516,13 @@ class Localiser:
             graph=self._graph,
             path_memory=self._paths,
             basin=self._basin,
-            observations=self._tried.observations,
+            observations=self._history.observations,
             reference=self._graph.index(self.position.node),
             own_path=self._own_path,
             stamp_ns=live.stamp_ns,
             seed=live.stamp_ns,
             foresee=lambda: self._foresee(live, neighbourhood),
-            run=self._tried.run(self._driven_m),
+            run=self._history.run(),
             hour=None if self._clock is None else hour_of_day(self._clock, live.stamp_ns),
             day=None if self._clock is None else day_of(self._clock, live.stamp_ns),
             background=self._background,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import takewhile
@@ -25,7 +25,7 @@ class IterationUnit(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RecentConfig:
-    """Settings of `RecentAttempts`.
+    """How far back the recent attempts reach.
 
     Raises:
         ConfigError: T is negative or the length is not positive.
@@ -75,63 +75,6 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.nodes)
-
-
-class RecentAttempts:
-    """The window over the last T iterations, fed by the localiser.
-
-    Call `begin_frame` before the attempts of a frame, and `add` after them; W is `observations`.
-    Frames see the T iterations before the current one, and its attempts so far.
-    """
-
-    def __init__(self, config: RecentConfig | None = None, first_iteration: int = 0) -> None:
-        self._config = RecentConfig() if config is None else config
-        # Node → twice the iteration of its latest attempt, plus its outcome; least recent first.
-        self._latest: dict[int, int] = {}
-        self._began_m: float | None = None
-        self._number = first_iteration - 1
-
-    @property
-    def iteration(self) -> int:
-        """Number of the current iteration; one less than the first before the first frame."""
-        return self._number
-
-    def begin_frame(self, driven_m: float) -> int:
-        """Begin a frame at this distance driven, metres; returns its iteration."""
-        by_distance = self._config.T_unit is IterationUnit.DISTANCE
-        if (
-            by_distance
-            and self._began_m is not None
-            and driven_m - self._began_m < self._config.iteration_m
-        ):
-            return self._number
-        self._began_m = driven_m
-        self._number += 1
-        self._forget()
-        return self._number
-
-    def add(self, nodes: Iterable[int], succeeded: Iterable[bool]) -> None:
-        """Remember attempts of the frame: dense indices and whether each was accepted."""
-        for node, outcome in zip(nodes, succeeded, strict=True):
-            self._latest.pop(node, None)
-            self._latest[int(node)] = 2 * self._number + bool(outcome)
-
-    @property
-    def observations(self) -> Observations:
-        """W and z now."""
-        if self._config.T == 0:
-            return Observations.none()
-        count = len(self._latest)
-        outcomes = np.fromiter(self._latest.values(), np.int64, count) & 1
-        return Observations(
-            np.fromiter(self._latest.keys(), np.int32, count), outcomes.astype(np.bool_)
-        )
-
-    def _forget(self) -> None:
-        """Drops nodes last attempted before the last T iterations."""
-        oldest = 2 * (self._number - self._config.T)
-        for node in list(takewhile(lambda node: self._latest[node] < oldest, self._latest)):
-            del self._latest[node]
 
 
 # Attempts farther back do not reflect the light here.
@@ -204,64 +147,120 @@ class RunAttempts:
         )
 
 
-class RunLog:
-    """Collects the attempts of one session as it drives: the last 4,096 of 200 m at most.
+class AttemptHistory:
+    """The attempts of one drive as it goes, from which policies learn.
 
-    A failure without a prediction is not kept, as it says nothing: a lost robot has dozens per
-    frame.
+    Call `begin_frame` before the attempts of a frame, and `add` after them. A failure without a
+    prediction is not kept, as it says nothing of the appearance here: a lost robot has dozens per
+    frame, all elsewhere.
+
+    Its views: `observations`, over the last T iterations and the current one so far; and `run`,
+    over the last 200 m, 4,096 attempts at most.
+
+    Args:
+        config: how far back the iterations reach.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, config: RecentConfig | None = None) -> None:
+        self.config = RecentConfig() if config is None else config
+        # Node → twice the iteration of its latest attempt, plus its outcome; least recent first.
+        self._latest: dict[int, int] = {}
+        self._began_m: float | None = None
+        self._number = -1
+        self._driven_m = 0.0
         self._columns = _columns(64)
         self._start = self._end = 0
         self._frames = 0
 
+    @property
+    def iteration(self) -> int:
+        """Number of the current iteration; one less than the first before the first frame."""
+        return self._number
+
+    def resume(self, next_iteration: int) -> None:
+        """Continues with this iteration, without the last ones."""
+        self._latest, self._began_m, self._number = {}, None, next_iteration - 1
+
+    def begin_frame(self, driven_m: float) -> int:
+        """Begins a frame at this distance driven, metres; returns its iteration."""
+        self._driven_m = driven_m
+        by_distance = self.config.T_unit is IterationUnit.DISTANCE
+        if (
+            by_distance
+            and self._began_m is not None
+            and driven_m - self._began_m < self.config.iteration_m
+        ):
+            return self._number
+        self._began_m = driven_m
+        self._number += 1
+        oldest = 2 * (self._number - self.config.T)
+        for node in list(takewhile(lambda node: self._latest[node] < oldest, self._latest)):
+            del self._latest[node]
+        return self._number
+
     def add(
         self,
-        driven_m: float,
         nodes: Sequence[int],
-        expected: tuple[NDArray[np.float64], NDArray[np.float64]],
+        foreseen: tuple[NDArray[np.float64], NDArray[np.float64]],
         accepted: Sequence[bool],
         inliers: Sequence[int],
         landmarks: int,
     ) -> None:
-        """Adds the R attempts of one frame.
+        """Adds the R attempts of the frame.
 
-        See `RunAttempts` for the arguments; `expected` holds `distance_m` and `rates`, (R,) float64
+        See `RunAttempts` for the arguments; `foreseen` holds `distance_m` and `rates`, (R,) float64
         each.
         """
         self._frames += len(nodes) > 0
-        distances_m, rates = (values.tolist() for values in expected)
-        tried = zip(nodes, distances_m, rates, accepted, inliers, strict=True)
-        told = [one for one in tried if one[3] or not math.isnan(one[1])]
-        if self._end + len(told) > len(self._columns[0]):
-            self._make_room(driven_m, len(told))
-        for row in told:
-            for column, value in zip(self._columns, (driven_m, *row, landmarks), strict=True):
+        distances_m, rates = (values.tolist() for values in foreseen)
+        rows = zip(nodes, distances_m, rates, accepted, inliers, strict=True)
+        kept = [row for row in rows if row[3] or not math.isnan(row[1])]
+        if self._end + len(kept) > len(self._columns[0]):
+            self._make_room(len(kept))
+        for row in kept:
+            self._latest.pop(row[0], None)
+            self._latest[int(row[0])] = 2 * self._number + bool(row[3])
+            for column, value in zip(self._columns, (self._driven_m, *row, landmarks), strict=True):
                 column[self._end] = value
             self._end += 1
 
-    def attempts(self, driven_m: float) -> RunAttempts:
-        """The attempts remembered after `driven_m` metres of the session.
+    @property
+    def observations(self) -> Observations:
+        """W and z now."""
+        if self.config.T == 0:
+            return Observations.none()
+        count = len(self._latest)
+        outcomes = np.fromiter(self._latest.values(), np.int64, count) & 1
+        return Observations(
+            np.fromiter(self._latest.keys(), np.int32, count), outcomes.astype(np.bool_)
+        )
 
-        Its arrays are views of data that never changes.
-        """
-        self._forget(driven_m)
+    def run(self) -> RunAttempts:
+        """The attempts of the last 200 m. Its arrays are views of data that never changes."""
+        self._forget()
         at_m, nodes, distance_m, rates, accepted, inliers, landmarks = (
             column[self._start : self._end] for column in self._columns
         )
         return RunAttempts(
-            driven_m, at_m, nodes, distance_m, rates, accepted, inliers, landmarks, self._frames
+            self._driven_m,
+            at_m,
+            nodes,
+            distance_m,
+            rates,
+            accepted,
+            inliers,
+            landmarks,
+            self._frames,
         )
 
-    def _forget(self, driven_m: float) -> None:
+    def _forget(self) -> None:
         at_m = self._columns[0][self._start : self._end]
-        if len(at_m) and at_m[0] < driven_m - _REMEMBERED_M:
-            self._start += int(np.searchsorted(at_m, driven_m - _REMEMBERED_M))
+        if len(at_m) and at_m[0] < self._driven_m - _REMEMBERED_M:
+            self._start += int(np.searchsorted(at_m, self._driven_m - _REMEMBERED_M))
         self._start = max(self._start, self._end - _REMEMBERED)
 
-    def _make_room(self, driven_m: float, count: int) -> None:
-        self._forget(driven_m)
+    def _make_room(self, count: int) -> None:
+        self._forget()
         kept = [column[self._start : self._end] for column in self._columns]
         self._start, self._end = 0, len(kept[0])
         self._columns = _columns(2 * (self._end + count))

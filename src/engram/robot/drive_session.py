@@ -25,7 +25,7 @@ from engram.geometry.cameras import StereoCamera
 from engram.graph.model import Clock, NodeId, PathEntry, Removal, Session, SessionId, path_id
 from engram.graph.placing import PlacingConfig
 from engram.localiser.acceptance import Rule
-from engram.localiser.attempts import Attempter, FrameMatcher
+from engram.localiser.attempts import Attempter, Lanes
 from engram.localiser.localisation import KEEPS_NOTHING, Keeper
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser
 from engram.localiser.relocalisation import ByAppearance, Relocaliser, Suggested
@@ -423,7 +423,7 @@ def loop_search(opened: Map, localiser: Localiser, settings: Settings) -> LoopSe
     if not isinstance(finder, ByAppearance):
         return None
     matching = settings.localiser
-    attempter = Attempter(opened.frames, matching, FrameMatcher(opened.frames, matching.matcher))
+    attempter = Attempter(opened.frames, matching, Lanes(opened.frames, matching.matcher))
     told = matching.lookalikes.doubt > 0 and matching.acceptance.rule is Rule.CONFIDENCE
     return LoopSearch(
         localiser.graph,

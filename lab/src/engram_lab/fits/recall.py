@@ -32,7 +32,7 @@ from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.ranking.context import Foreseen, RankingContext, RankingPolicy
 from engram.ranking.policies import policy_named
 from engram.ranking.recall import RECALL, RecallConstants, RecallPolicy
-from engram.ranking.recent import RecentAttempts, RunLog
+from engram.ranking.recent import AttemptHistory
 from engram.robot.localisers import localiser_in
 from engram.robot.settings import Settings
 from engram_lab.programs import Figure, command_line, report
@@ -146,23 +146,22 @@ def replay(
     drive: Recorded, policy: RankingPolicy, lanes: int = 2
 ) -> Iterator[tuple[Seen, RankingContext, NDArray[np.int64]]]:
     """Each frame with what the policy got to see and what it picked, as if it had driven."""
-    recent, run = RecentAttempts(), RunLog()
+    history = AttemptHistory()
     reference = drive.frames[0].context.reference if drive.frames else None
     for seen in drive.frames:
-        recent.begin_frame(seen.driven_m)
+        history.begin_frame(seen.driven_m)
         context = dataclasses.replace(
             seen.context,
-            observations=recent.observations,
-            run=run.attempts(seen.driven_m),
+            observations=history.observations,
+            run=history.run(),
             reference=reference,
         )
         picks = policy.rank(context)[:lanes]
         near, accepted = context.neighbourhood, seen.foreseen.accepted[picks]
         nodes, inliers = near.nodes[picks].tolist(), seen.foreseen.inliers[picks]
         rates = context.success_rates()[picks]
-        recent.add(nodes, accepted.tolist())
         away_m = np.where(accepted, near.distance_m[picks], near.rms_distance_m[picks])
-        run.add(seen.driven_m, nodes, (away_m, rates), accepted.tolist(), list(inliers), 0)
+        history.add(nodes, (away_m, rates), accepted.tolist(), list(inliers), 0)
         if accepted.any():
             reference = nodes[int(np.argmax(np.where(accepted, inliers, -1)))]
         yield seen, context, picks

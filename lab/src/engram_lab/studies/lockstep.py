@@ -31,7 +31,7 @@ from engram.graph.basin import DEFAULT_RADIUS_M
 from engram.graph.model import NodeId
 from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.localiser.acceptance import Prediction, Spread
-from engram.localiser.attempts import FrameMatcher, Matcher
+from engram.localiser.attempts import Candidate, Lanes, Matcher, one_by_one
 from engram.localiser.localisation import Hint, Keeper, Localisation, Position
 from engram.localiser.localiser import Localiser
 from engram.maps.map import Map
@@ -442,7 +442,7 @@ class MatchMemo:
         """The memo that is kept in a folder of one drive in maps of the same nodes."""
         config = settings.localiser.matcher
         path = folder / f"memo-{drive.key}.matches.npz"
-        return MatchMemo(FrameMatcher(opened.frames, config), path, matcher_hash(config))
+        return MatchMemo(Lanes(opened.frames, config), path, matcher_hash(config))
 
     @property
     def known(self) -> int:
@@ -460,6 +460,12 @@ class MatchMemo:
         if match is None:
             match = known[node] = self._make(live, live_id, node)
         return match
+
+    def matches(
+        self, live: Frame, live_id: NodeId, candidates: Sequence[Candidate]
+    ) -> list[Match | None]:
+        """See `Matcher`."""
+        return one_by_one(self, live, live_id, candidates)
 
     def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
         """See `Matcher`."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from engram.config import to_dict
 from engram.errors import ConfigError
-from engram.localiser.attempts import FrameMatcher, Matcher
+from engram.localiser.attempts import Lanes, Matcher
 from engram.maps.map import Map, open_map
 from engram.monitor import QUIET, Monitor
 from engram.ranking.policies import policy_named
@@ -84,7 +84,7 @@ def localise_held_out(
             opened,
             frames,
             drive.session.id,
-            FrameMatcher(opened.frames, config.matcher) if matcher is None else matcher,
+            Lanes(opened.frames, config.matcher) if matcher is None else matcher,
             config.acceptance,
         )
     situation = Situation(opened, drive, frames, start, nodes, truth)

@@ -25,7 +25,7 @@ from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram.graph.model import NodeId, node_id
 from engram.localiser.acceptance import AcceptanceConfig, Rule
-from engram.localiser.attempts import FrameMatcher
+from engram.localiser.attempts import Lanes
 from engram.localiser.localisation import Budget, Localisation, Position
 from engram.odometry.motion import GapFiller
 from engram.odometry.odometry import Odometry
@@ -325,7 +325,7 @@ def switched_on(there: Street, first: int) -> Count:
 
 def could_be_found(there: Street, first: int, frames: int) -> Count:
     """One robot if matching with the nodes near finds one of the frames; none if not."""
-    matcher = FrameMatcher(there.opened.frames, there.settings.localiser.matcher)
+    matcher = Lanes(there.opened.frames, there.settings.localiser.matcher)
     for at in range(first, first + frames):
         live = there.frames[at].frame
         live_id = node_id(there.live.session.id, live.stamp_ns)

@@ -30,7 +30,7 @@ from engram.fleet.merge.merging import merge as merge_maps
 from engram.graph.clock import hour_of_day
 from engram.graph.model import Node, SessionId, node_id, path_id
 from engram.localiser.acceptance import accept_lost
-from engram.localiser.attempts import FrameMatcher
+from engram.localiser.attempts import Lanes
 from engram.localiser.localisation import Localisation, Position
 from engram.localiser.relocalisation import Relocaliser
 from engram.maps.map import Map, open_map
@@ -385,7 +385,7 @@ def _in_vain_ms(
     landmarks are in memory, as they are for those who are lost for a while.
     """
     landmarks, acceptance = opened.frames, settings.localiser.acceptance
-    matcher = FrameMatcher(landmarks, settings.localiser.lost_matcher)
+    matcher = Lanes(landmarks, settings.localiser.lost_matcher)
     session = session_of_drive(log).id
     for logged in islice(log, 0, None, max(len(log) // _LOST_PLACES, 1)):
         live = logged.frame
