@@ -9,7 +9,8 @@ from engram.frontend.matching import Match
 from engram.geometry.se3 import SE3
 from engram.graph.model import NodeId
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, Rule
-from engram.localiser.attempts import Candidate, Outcome, best_success, outcome_at, uncontested
+from engram.localiser.attempts import Candidate, Outcome, outcome_at
+from engram.localiser.fixes import best_success, uncontested
 
 NOTHING = np.zeros(0, np.int32)
 

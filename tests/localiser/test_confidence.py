@@ -26,8 +26,8 @@ from engram.localiser.confidence import (
     Standing,
     confidence_of,
 )
+from engram.localiser.fixes import FixChain
 from engram.localiser.localisation import Position
-from engram.localiser.tracking import FixChain
 
 MODEL = confidence_of(BRIEF)
 WIDE = Spread(0.5, 0.9, 10.0)

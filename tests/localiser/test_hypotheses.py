@@ -15,8 +15,8 @@ from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
 from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.localiser.acceptance import AcceptanceConfig
 from engram.localiser.attempts import Candidate, Outcome
+from engram.localiser.fixes import Hypotheses
 from engram.localiser.localisation import Position
-from engram.localiser.relocalisation import Hypotheses
 from engram.localiser.settings import HypothesesConfig
 
 SESSION = SessionId(UUID(int=1))

@@ -16,8 +16,8 @@ from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, path_id
 from engram.graph.proximity import lay_proximity_edges, tighten_chain
 from engram.localiser.acceptance import AcceptanceConfig
+from engram.localiser.fixes import MOST_ON_TRIAL, FixChain
 from engram.localiser.localisation import Position
-from engram.localiser.tracking import MOST_ON_TRIAL, FixChain
 from engram.mapper.loops import LoopSearch
 from engram.mapper.mapper import Memory, Records, Saver
 from engram.testing.contracts import make_node

@@ -1,11 +1,11 @@
-"""Attempts to match a frame with candidates, the choice among them, and their record."""
+"""Attempts to match a frame with candidates, and their record."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -29,26 +29,12 @@ from engram.geometry.se3 import SE3
 from engram.graph.basin import MatchBasin
 from engram.graph.model import Attempt, LandmarkSource, NodeId
 from engram.graph.neighbourhood import Neighbourhood
-from engram.localiser.acceptance import (
-    AcceptanceConfig,
-    Lenses,
-    Prediction,
-    Rule,
-    Spread,
-    accept,
-    accept_lost,
-    apart,
-    determined,
-    inlier_spread,
-    plausible,
-)
-from engram.localiser.confidence import UNKNOWN, Evidence, Standing, confidence_of
+from engram.localiser.acceptance import Lenses, Prediction, Rule, Spread, inlier_spread
+from engram.localiser.confidence import UNKNOWN, Evidence, Standing
+from engram.localiser.fixes import LEAST_WEIGHED, MatchRule
 from engram.localiser.localisation import Position
 from engram.localiser.settings import LocaliserConfig
 from engram.ranking.recent import AttemptHistory
-
-# Matches of fewer inliers are wrong or useless; their spread is not worth computing.
-_LEAST_WEIGHED = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,6 +223,7 @@ class Attempter:
         self._matcher = self._lanes if matcher is None else matcher
         self._frames = frames
         self._acceptance = config.acceptance
+        self._rule = MatchRule(config.acceptance)
         self._narrow = config.narrow_m, config.narrow_rad
 
     def close(self) -> None:
@@ -297,7 +284,7 @@ class Attempter:
         once = acceptance.rule is Rule.INLIERS or not self._narrow[0]
         if once or prediction is None or not candidate.standing.agreed:
             return match
-        if match is None or match.reference_from_live is None or match.inliers < _LEAST_WEIGHED:
+        if match is None or match.reference_from_live is None or match.inliers < LEAST_WEIGHED:
             return match
         far_m = _apart_m(match.reference_from_live, prediction.node_from_live)
         weak = match.inliers < acceptance.min_inliers
@@ -322,78 +309,15 @@ class Attempter:
         if match.reference_from_live is None:
             return Outcome(candidate, rank, match, accepted=False)
         spread = partial(self._matcher.spread, live, live_id, candidate.node, match)
-        evidence = self._evidence(live, candidate, match, spread)
-        model = confidence_of(live.descriptor)
-        anywhere = candidate.prediction is None or candidate.doubted
-        readings = (
-            model.as_predicted(evidence),
-            model.as_anywhere(evidence) if anywhere else -math.inf,
-        )
-        if self._acceptance.rule is Rule.CONFIDENCE:
-            accepted, waits = self._weighed(candidate, match, readings, model.witness)
-        else:
-            accepted, waits = self._counted(candidate, match, spread)
+        verdict = self._rule.verdict(live, candidate, match, spread)
         return Outcome(
-            candidate, rank, match, accepted, waits, confidence=max(readings), evidence=evidence
-        )
-
-    def _evidence(
-        self, live: Frame, candidate: Candidate, match: Match, spread: Callable[[], Spread]
-    ) -> Evidence:
-        assert match.reference_from_live is not None
-        assert match.covariance is not None
-        prediction, acceptance = candidate.prediction, self._acceptance
-        pose = match.reference_from_live
-        x_m2, y_m2, z_m2 = match.covariance.diagonal()[:3].tolist()
-        in_reach = pose.distance_m <= acceptance.reach_m
-        unproved = prediction is None or candidate.doubted or not candidate.standing.agreed
-        weak = match.inliers < confidence_of(live.descriptor).weak_inliers
-        spreads = (in_reach if unproved else weak) and match.inliers >= _LEAST_WEIGHED
-        return Evidence(
-            match.inliers,
-            match.inliers / (len(live.landmarks) + live.left_out),
-            pose.distance_m,
-            math.sqrt(x_m2 + y_m2 + z_m2),
-            candidate.standing,
-            math.inf if prediction is None else prediction.sigma_m,
-            math.inf if prediction is None else apart(pose, prediction, acceptance),
-            spread() if spreads else None,
-        )
-
-    def _weighed(
-        self, candidate: Candidate, match: Match, readings: tuple[float, float], witness: float
-    ) -> tuple[bool, bool]:
-        """Whether a match is a localisation, and whether it would be one with a second.
-
-        Where the position was only supplied by the caller, a second match may repeat the error of
-        the first: it confirms what would also be accepted without that position.
-        """
-        acceptance, confirmed = self._acceptance, candidate.standing.agreed > 0
-        if match.inliers < acceptance.min_inliers or not determined(match, acceptance):
-            return False, False
-        predicted, anywhere = readings
-        least = sure = acceptance.min_confidence_lost
-        if candidate.lost_long:
-            sure = max(acceptance.sure_confidence, least)
-        over = anywhere - least
-        near = predicted - (
-            acceptance.min_confidence if confirmed else acceptance.min_confidence_told
-        )
-        waits = over >= -witness or (confirmed and near >= -witness)
-        return max(anywhere - sure, near) >= 0, waits
-
-    def _counted(
-        self, candidate: Candidate, match: Match, spread: Callable[[], Spread]
-    ) -> tuple[bool, bool]:
-        """The same by the published rule, in inliers."""
-        acceptance, prediction = self._acceptance, candidate.prediction
-        spread = cache(spread)
-        if prediction is not None and accept(match, prediction, acceptance):
-            return True, False
-        anywhere = prediction is None or candidate.doubted
-        return (
-            prediction is None and accept_lost(match, spread, acceptance),
-            anywhere and plausible(match, spread, acceptance),
+            candidate,
+            rank,
+            match,
+            verdict.accepted,
+            verdict.waits,
+            confidence=verdict.confidence,
+            evidence=verdict.evidence,
         )
 
     def with_rows(self, live: Frame, live_id: NodeId, outcome: Outcome) -> Match:
@@ -431,54 +355,6 @@ def alternate(first: list[Candidate], second: list[Candidate]) -> list[Candidate
     shorter = min(len(first), len(second))
     paired = [item for pair in zip(first, second, strict=False) for item in pair]
     return paired + first[shorter:] + second[shorter:]
-
-
-def uncontested(outcomes: Sequence[Outcome], config: AcceptanceConfig) -> list[Outcome]:
-    """Outcomes of one frame, of which those stay accepted that no other match contests.
-
-    In rain twenty inliers may agree by chance, a metre off. Often another match of the frame has
-    nearly as many, lies elsewhere, and nearer to where odometry puts the robot.
-    """
-    if len(outcomes) < 2 or not any(one.accepted for one in outcomes):
-        return list(outcomes)
-    moved = [_correction(one) for one in outcomes]
-
-    def contested(at: int) -> bool:
-        mine = moved[at]
-        return mine is not None and any(
-            its is not None
-            and rival.match.inliers >= config.rival_share * outcomes[at].match.inliers
-            and its.distance_m < mine.distance_m
-            and np.linalg.norm(its.translation - mine.translation) > config.slack_m
-            for rival, its in zip(outcomes, moved, strict=True)
-        )
-
-    return [
-        replace(one, accepted=False) if one.accepted and contested(at) else one
-        for at, one in enumerate(outcomes)
-    ]
-
-
-def _correction(outcome: Outcome) -> SE3 | None:
-    """The measured pose of the live camera in the predicted one; None unless both are known."""
-    prediction, measured = outcome.candidate.prediction, outcome.match.reference_from_live
-    if prediction is None or measured is None:
-        return None
-    return prediction.node_from_live.inverse() @ measured
-
-
-def best_success(outcomes: Sequence[Outcome], rule: Rule) -> Outcome | None:
-    """The accepted outcome that is surest, then of the best rank (method §3.2).
-
-    By the published rule that is the one with the most inliers. In rain, of two matches of one
-    frame the one with a few more of them is sometimes a metre off.
-    """
-    successes = [outcome for outcome in outcomes if outcome.accepted]
-
-    def least(one: Outcome) -> tuple[float, int]:
-        return -(one.confidence if rule is Rule.CONFIDENCE else one.match.inliers), one.rank
-
-    return min(successes, key=least, default=None)
 
 
 def outcome_at(outcomes: Sequence[Outcome], node: NodeId | None) -> Outcome | None:

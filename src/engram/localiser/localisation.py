@@ -265,14 +265,12 @@ class Keeper:
         del live, motion
         return None
 
-    def may_propose(self, *, certain: bool) -> bool:
-        """Whether to try places all over the map; `certain` if the position is known."""
-        del certain
+    def may_propose(self) -> bool:
+        """Whether to try places all over the map."""
         return True
 
-    def may_propose_own(self, *, certain: bool) -> bool:
+    def may_propose_own(self) -> bool:
         """The same for nodes that the session itself saved."""
-        del certain
         return True
 
     def alone_m(self) -> float:

@@ -38,12 +38,10 @@ from engram.localiser.attempts import (
     Outcome,
     add_outcomes,
     alternate,
-    best_success,
     split_at_first_success,
     stored_attempts,
-    uncontested,
 )
-from engram.localiser.confidence import confidence_of
+from engram.localiser.fixes import Fixes, best_success
 from engram.localiser.localisation import (
     KEEPS_NOTHING,
     Budget,
@@ -53,10 +51,9 @@ from engram.localiser.localisation import (
     Position,
     StageClock,
 )
-from engram.localiser.relocalisation import Hypotheses, Relocaliser
+from engram.localiser.relocalisation import Relocaliser
 from engram.localiser.settings import LocaliserConfig, NeighbourhoodSearch, PathEntries, Success
-from engram.localiser.tracking import Prover, Track
-from engram.localiser.yardstick import Likeness, Run, Yardstick, is_measured
+from engram.localiser.tracking import Track
 from engram.odometry.motion import UNMOVED, Motion
 from engram.odometry.step import OdometryStatus
 from engram.processes import cores
@@ -173,28 +170,18 @@ class Localiser:
         # On one core each hand-over between threads would only cost.
         lanes = min(budget.lanes, threads or budget.lanes) if cores() > 1 else 1
         self._attempter = Attempter(known.frames, self.config, matcher, lanes)
-        self._prover = Prover(known.graph, self.config.acceptance)
-        self._yardstick = Yardstick(known.graph, self._attempter.frame, self.config.matcher)
-        self._run = Run(self.config.lookalikes)
-        # The last frame's best match, if it was doubted: a wrong calibration looks like it, too.
-        self._doubted: Outcome | None = None
-        self._hypotheses = Hypotheses(
-            known.graph,
-            self._nodes_near,
-            self.config.acceptance,
-            self.config.followed_gap_m,
-            self.config.hypotheses,
-        )
         self._lenses = self._lenses_of_map()
         self._history = AttemptHistory(self.config.recent)
         # The published rule knows no more than the last match.
         once = self.config.acceptance.rule is Rule.INLIERS
-        self._track = Track(known.graph, 0.0 if once else self.config.earlier_doubt)
+        doubt = 0.0 if once else self.config.earlier_doubt
+        self._track = Track(known.graph, doubt, self.config.greatest_gap_m)
+        self._fixes = Fixes(
+            known.graph, self._track, self._nodes_near, self._attempter, self.config
+        )
         self._open_loop_m = 0.0
         self._driven_m = 0.0
         self._motion = UNMOVED
-        # Variance of the motion guessed since the robot last knew where it was, m².
-        self._guessed_m2 = 0.0
         self._outcomes: list[Outcome] = []
         # Attempts of the last frame that its first success made useless.
         self._beyond: list[Outcome] = []
@@ -275,7 +262,7 @@ class Localiser:
             and not one.damaged
             and self._graph.node(one.candidate.index).session != self.live
         ]
-        best = max(tried, key=lambda one: one.match.inliers, default=self._doubted)
+        best = max(tried, key=lambda one: one.match.inliers, default=self._fixes.lookalike)
         return None if best is None else self._attempter.frame(best.candidate.node)
 
     def attempts(self) -> list[Attempt]:
@@ -304,12 +291,11 @@ class Localiser:
             agreed: number of fixes that confirm it; 0 for a position that only the caller supplied.
             said: whether the caller supplied it, which may be wrong if the robot was certain.
         """
-        self._prover.forget(agreed, told_otherwise=said and self.certain)
-        self._run.begin()
+        self._fixes.forget(agreed, told_otherwise=said and self.certain)
         self._track.set(position)
         if open_loop_m is not None:
             self._open_loop_m = open_loop_m
-        self._guessed_m2 = guessed_m**2
+        self._track.guessed_m2 = guessed_m**2
 
     def standing_at(self, node: NodeId, live: Frame, covariance: NDArray[np.float64]) -> Position:
         """Position of a robot standing where the node was recorded; see `Position.mounted`.
@@ -327,9 +313,8 @@ class Localiser:
     def lose(self) -> None:
         """Discards the position: the robot was restarted or carried elsewhere."""
         self._track.set(None)
-        self._prover.forget()
-        self._run.begin()
-        self._hypotheses.forget()
+        self._fixes.forget()
+        self._fixes.forget_waiting()
         if self._relocaliser is not None:
             self._relocaliser.forget()
 
@@ -361,8 +346,8 @@ class Localiser:
     def settle_in(self, node: NodeId) -> None:
         """Sets the position to `node`, as which the live frame was just saved (method §4)."""
         self._track.set(Position.at(node))
-        self._prover.settled()
-        self._guessed_m2 = 0.0
+        self._fixes.settled()
+        self._track.guessed_m2 = 0.0
 
     def localise(
         self,
@@ -385,7 +370,7 @@ class Localiser:
         clock = clock or StageClock()
         self._new_damaged, self._near, self._looked_up, self._beyond = (), None, False, []
         self._history.begin_frame(self._driven_m)
-        self._prover.begin_frame(self._motion.odometry.inliers)
+        self._fixes.begin_frame(self._motion.odometry.inliers)
         outcomes: list[Outcome] = []
         if live.status is FrameStatus.OK:
             self._near = self._neighbourhood()
@@ -404,23 +389,27 @@ class Localiser:
             if self.config.success is Success.FIRST:
                 outcomes, beyond = split_at_first_success(outcomes)
                 self._beyond = [one for one in beyond if not one.damaged]
-            outcomes = self._believed(live, self._judged(live, outcomes))
+            readable = self._without_damaged(outcomes)
+            outcomes = self._fixes.judged(live, live_id, self._driven_m, readable)
             clock.lap("attempts")
             add_outcomes(self._history, live, self._near, outcomes, self._basin, self._lenses)
-        success = self._conclude(live, outcomes, keeper.alone_m())
+        success = self._conclude(live, outcomes, keeper)
         clock.lap("remember")
         return self._result(live, success, clock.stage_ms)
 
-    def _conclude(self, live: Frame, outcomes: list[Outcome], alone_m: float) -> Outcome | None:
+    def _conclude(self, live: Frame, outcomes: list[Outcome], keeper: Keeper) -> Outcome | None:
         """Sets the position to that of the best match; without one, reports the failures."""
         self._outcomes = outcomes
         self._reference = None if self.position is None else self.position.node
         success = best_success(outcomes, self.config.acceptance.rule)
         if success is not None:
-            self._settle(live, success, alone_m)
+            self._fixes.fix(live, success, keeper)
+            self._open_loop_m = 0.0
+            if self._relocaliser is not None:
+                self._relocaliser.forget()
             return success
         if any(one.candidate.row is not None for one in outcomes):
-            self._prover.missed()
+            self._fixes.missed()
         if self._relocaliser is not None:
             self._relocaliser.failed(
                 [
@@ -443,23 +432,22 @@ class Localiser:
             return
         self._open_loop_m += motion.moved_m
         if motion.guessed_m:
-            self._guessed_m2 += motion.guessed_m**2
+            self._track.guessed_m2 += motion.guessed_m**2
         else:
             self._driven_m += motion.moved_m
         if motion.jumped:
-            self._guessed_m2 = math.inf
-            self._hypotheses.forget()
-        self._hypotheses.carry_on(motion.prev_from_curr, motion.covariance)
+            self._track.guessed_m2 = math.inf
+            self._fixes.forget_waiting()
         if self._relocaliser is not None:
             followed = not motion.jumped and motion.guessed_m <= self.config.followed_gap_m
             self._relocaliser.carry_on(motion.prev_from_curr if followed else None)
-        self._track.carry_on(motion.prev_from_curr, motion.covariance)
-        self._prover.carry_on(motion.prev_from_curr, motion.covariance)
+        for follower in (self._track, self._fixes):
+            follower.carry_on(motion.prev_from_curr, motion.covariance)
 
     @property
     def certain(self) -> bool:
         """Whether the position is known: odometry since the last match had only short gaps."""
-        return self.position is not None and self._guessed_m2 <= self.config.greatest_gap_m**2
+        return self._track.certain
 
     @property
     def _lost(self) -> bool:
@@ -471,7 +459,7 @@ class Localiser:
 
     @property
     def _looks_elsewhere(self) -> bool:
-        return self._lost or self._prover.doubted
+        return self._lost or self._fixes.doubted
 
     def _lenses_of_map(self) -> Lenses:
         sessions, cameras = self._background.sessions, self._background.cameras
@@ -572,11 +560,11 @@ class Localiser:
             ][:budget]
         if (ranked and not self._looks_elsewhere) or self._relocaliser is None:
             return ranked
-        if not keeper.may_propose(certain=self.certain):
+        if not keeper.may_propose():
             return ranked
         known = {candidate.index for candidate in ranked}
         budget = self._budget.lost_attempts
-        indices = self._hypotheses.nodes_near(_CONFIRMING) + self._proposals(live, budget, keeper)
+        indices = self._fixes.nodes_to_confirm(_CONFIRMING) + self._proposals(live, budget, keeper)
         proposed = [
             Candidate(
                 index,
@@ -584,7 +572,7 @@ class Localiser:
                 None,
                 guided=False,
                 row=None,
-                standing=self._prover.standing,
+                standing=self._fixes.standing,
                 lost_long=self._lost_long,
             )
             for index in dict.fromkeys(indices)
@@ -597,7 +585,7 @@ class Localiser:
         """The relocaliser's nodes, without known ones of this session."""
         assert self._relocaliser is not None
         self._looked_up = True
-        own = keeper.may_propose_own(certain=self.certain)
+        own = keeper.may_propose_own()
         return self._relocaliser.propose(
             live,
             count,
@@ -625,53 +613,8 @@ class Localiser:
         )
         # A mapping robot knows its position by its own nodes; loop closure has stricter tests.
         doubted = self._looks_elsewhere and not (self.certain and self._own_session is not None)
-        node, standing = self._graph.node(index).id, self._prover.standing
+        node, standing = self._graph.node(index).id, self._fixes.standing
         return Candidate(index, node, prediction, guided, row, doubted, standing, self._lost_long)
-
-    def _judged(self, live: Frame, outcomes: list[Outcome]) -> list[Outcome]:
-        """Outcomes of readable nodes, with those accepted that an earlier match confirms.
-
-        What another match of the frame contests is not, but by the published rule.
-        """
-        acceptance, readable = self.config.acceptance, self._without_damaged(outcomes)
-        if acceptance.rule is Rule.INLIERS:
-            return self._hypotheses.judge(readable, 0.0)
-        confirms = confidence_of(live.descriptor).witness
-        return uncontested(self._hypotheses.judge(readable, confirms), acceptance)
-
-    def _believed(self, live: Frame, outcomes: list[Outcome]) -> list[Outcome]:
-        """The same outcomes, none accepted while the run of matches may be one of look-alikes."""
-        best = best_success(outcomes, self.config.acceptance.rule)
-        self._doubted = None
-        if best is None or not self._tells_lookalikes(live):
-            return outcomes
-        predicted = best.evidence is not None and math.isfinite(best.evidence.apart)
-        if self._run.believed and not predicted:
-            self._run.begin()
-        if self._run.due(self._driven_m):
-            likeness = self._likeness(live, best)
-            if likeness is not None:
-                self._run.add(likeness, self._driven_m)
-        if self._run.believed:
-            return outcomes
-        self._doubted = best
-        return [replace(one, accepted=False) if one.accepted else one for one in outcomes]
-
-    def _tells_lookalikes(self, live: Frame) -> bool:
-        by_confidence = self.config.acceptance.rule is Rule.CONFIDENCE
-        return by_confidence and self.config.lookalikes.doubt > 0 and is_measured(live.descriptor)
-
-    def _likeness(self, live: Frame, found: Outcome) -> Likeness | None:
-        """What the match shows; None if its node's drive saved no neighbour of the node."""
-        usual = self._yardstick.usual(found.candidate.index)
-        reference = self._attempter.frame(found.candidate.node)
-        if usual is None or reference is None:
-            return None
-        match = self._attempter.with_rows(live, node_id(self.live, live.stamp_ns), found)
-        if not len(match.live_rows):
-            return None
-        tracked = self._motion.odometry.inliers
-        return Likeness.of(match, reference, live, usual, tracked)
 
     def _without_damaged(self, outcomes: list[Outcome]) -> list[Outcome]:
         """Outcomes of readable nodes; the others are reported, and not attempted again."""
@@ -680,37 +623,18 @@ class Localiser:
         self._damaged.update(candidate.index for candidate in damaged)
         return [outcome for outcome in outcomes if not outcome.damaged]
 
-    def _settle(self, live: Frame, success: Outcome, alone_m: float) -> None:
-        """Sets the position to (n, ``T_n_q``) and the open loop to 0 (method §3.3)."""
-        usual = self._yardstick.usual(success.candidate.index)
-        self._prover.prove(
-            live,
-            success,
-            self.position,
-            alone_m,
-            certain=self.certain,
-            usual=None if usual is None else usual.inliers,
-        )
-        leans = self._prover.leans(live, success, certain=self.certain)
-        self._track.fix(success.position, leans=leans)
-        self._open_loop_m = 0.0
-        self._guessed_m2 = 0.0
-        self._hypotheses.forget()
-        if self._relocaliser is not None:
-            self._relocaliser.forget()
-
     @property
     def told_otherwise(self) -> bool:
         """Whether a caller-supplied position contradicts the robot's own.
 
         No edge is created until a fix confirms it.
         """
-        return self._prover.told_otherwise
+        return self._fixes.told_otherwise
 
     @property
     def on_trial(self) -> bool:
         """Whether the last fixes may still be withdrawn: no edge should rest on them yet."""
-        return self._prover.on_trial or not self._run.proved
+        return self._fixes.on_trial
 
     def _result(
         self,
@@ -731,7 +655,7 @@ class Localiser:
             position=self._track.best_after(self._motion.ahead),
             looked_up=self._looked_up,
             damaged=self._new_damaged,
-            withdraws=self._prover.withdraws,
+            withdraws=self._fixes.withdraws,
             node=None if node is None else node.id,
             node_stamp_ns=None if node is None else node.stamp_ns,
             node_from_live=None if best is None else best.node_from_live,

@@ -39,9 +39,9 @@ from engram.graph.model import (
 from engram.graph.proximity import ProximityConfig, lay_proximity_edges, tighten_chain
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
 from engram.localiser.attempts import Outcome
+from engram.localiser.fixes import MOST_ON_TRIAL
 from engram.localiser.localisation import Hint, Keeper, Localisation, LocalisationStatus, Position
 from engram.localiser.localiser import Localiser
-from engram.localiser.tracking import MOST_ON_TRIAL
 from engram.mapper.loops import LoopSearch
 from engram.maps.records import StoredSession
 from engram.odometry.motion import Motion
@@ -537,17 +537,17 @@ class Mapper(Memory):
         self._closures = self._close_loops(self._loops.closed()) if self._loops else []
         return None
 
-    def may_propose(self, *, certain: bool) -> bool:
+    def may_propose(self) -> bool:
         """See `Keeper`.
 
         A robot whose nodes are connected to the map is not lost, however far it drifts: loop
         closure runs during the drive.
         """
-        return not certain or self._loops is None or not self._joined
+        return not self._localiser.certain or self._loops is None or not self._joined
 
-    def may_propose_own(self, *, certain: bool) -> bool:
+    def may_propose_own(self) -> bool:
         """See `Keeper`."""
-        return not certain or self._loops is None
+        return not self._localiser.certain or self._loops is None
 
     def alone_m(self) -> float:
         """See `Keeper`."""

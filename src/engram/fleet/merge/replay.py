@@ -334,13 +334,13 @@ class Replay(Keeper):
             open_loop_m = node.driven_m - self._matched_at_m.get(node.session, -math.inf)
         return Hint(known, open_loop_m, agreed=_AGREED)
 
-    def may_propose_own(self, *, certain: bool) -> bool:
+    def may_propose_own(self) -> bool:
         """See `Keeper`.
 
         While odometry holds, a drive's match with its own nodes far back is a loop, which the robot
         closed itself and whose edges come along, or a look-alike, which would take nodes away.
         """
-        return not certain
+        return not self._localiser.certain
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:
         """See `Keeper`: omits or takes the node, once its fix is no longer on trial."""
