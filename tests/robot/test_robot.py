@@ -20,10 +20,10 @@ from engram.errors import MapError
 from engram.localiser.localisation import (
     Budget,
     Hint,
-    Keeper,
     Localisation,
     LocalisationStatus,
     Position,
+    ResultSink,
 )
 from engram.localiser.localiser import Localiser
 from engram.maps.map import open_map
@@ -238,7 +238,7 @@ def test_a_frame_at_which_the_map_failed_is_driven_all_the_same(
 ) -> None:
     at_ns = LIVE[4].frame.stamp_ns
 
-    class Failing(Keeper):
+    class Failing(ResultSink):
         def hint(self, live, motion) -> Hint | None:
             if live.stamp_ns == at_ns:
                 raise MapError("the disk failed")
@@ -268,7 +268,7 @@ def test_a_robot_is_placed_and_lost_again(localiser: Localiser) -> None:
     assert robot.step(LIVE[2].logged).localised
 
 
-class Recording(Keeper):
+class Recording(ResultSink):
     """Notes what it hears; holds back what may still be withdrawn."""
 
     def __init__(self) -> None:
@@ -287,13 +287,13 @@ class Recording(Keeper):
 
 
 def test_a_keeper_hears_what_was_found_and_later_what_was_withdrawn(localiser: Localiser) -> None:
-    keeper = Recording()
-    robot = Robot(Front(Settings()), localiser, keeper)
+    result_sink = Recording()
+    robot = Robot(Front(Settings()), localiser, result_sink)
     found = [robot.step(seen.logged) for seen in LIVE[:3]]
     robot.withdraw(found[1])
     stamps_ns = [one.stamp_ns for one in found]
     told = [(what, stamp) for stamp in stamps_ns for what in ("hint", "keep")]
-    assert keeper.heard == [*told, ("withdrawn", stamps_ns[1])]
+    assert result_sink.heard == [*told, ("withdrawn", stamps_ns[1])]
     assert robot.pose_at(stamps_ns[1]) is None
     assert robot.pose_at(stamps_ns[2]) is not None
 
@@ -301,7 +301,7 @@ def test_a_keeper_hears_what_was_found_and_later_what_was_withdrawn(localiser: L
 def test_what_a_keeper_knows_is_not_localised_again(localiser: Localiser) -> None:
     known = Robot(Front(Settings()), localiser).step(LIVE[0].logged)
 
-    class Knowing(Keeper):
+    class Knowing(ResultSink):
         def hint(self, live, motion) -> Hint:
             return Hint(known.position, found=replace(known, stamp_ns=live.stamp_ns))
 

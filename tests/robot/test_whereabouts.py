@@ -13,7 +13,7 @@ from engram.graph.model import NodeId
 from engram.localiser.localisation import Position
 from engram.maps.map import open_map
 from engram.robot.mapping import Beginning, map_drive
-from engram.robot.robot import Whereabouts
+from engram.robot.robot import DisplayPose
 from engram.robot.settings import RobotOptions
 from engram.sequences.opening import open_drive
 
@@ -25,8 +25,8 @@ def test_a_first_drive_lies_where_the_committed_frame_will_have_it(
     seen: list[tuple[object, SE3 | None]] = []
 
     def begin(begun: Beginning) -> None:
-        whereabouts = Whereabouts(begun.opened.frame, begun.robot.graph)
-        begun.robot.watch = lambda _, found: seen.append((found.saved, whereabouts.after(found)))
+        display_pose = DisplayPose(begun.opened.frame, begun.robot.graph)
+        begun.robot.watch = lambda _, found: seen.append((found.saved, display_pose.after(found)))
 
     map_drive(path, open_drive(street, frames="::2"), begin=begin)
     assert seen
@@ -48,8 +48,8 @@ def test_a_second_drive_lies_in_the_frame_of_the_first(street: Path, tmp_path: P
     here = []
 
     def begin(begun: Beginning) -> None:
-        whereabouts = Whereabouts(begun.opened.frame, begun.robot.graph)
-        begun.robot.watch = lambda _, found: here.append((found, whereabouts.after(found)))
+        display_pose = DisplayPose(begun.opened.frame, begun.robot.graph)
+        begun.robot.watch = lambda _, found: here.append((found, display_pose.after(found)))
 
     map_drive(path, open_drive(street, frames="1::2"), options=RobotOptions(), begin=begin)
     with open_map(path) as opened:
@@ -80,15 +80,15 @@ def test_what_a_lost_robot_saved_lies_where_the_graph_joins_it(
             def find(self, node: NodeId) -> SE3 | None:
                 return frame.find(node) if opened.graph.index(node) < len(nodes) // 2 else None
 
-        whereabouts = Whereabouts(Half(), opened.graph)  # type: ignore[arg-type]
+        display_pose = DisplayPose(Half(), opened.graph)  # type: ignore[arg-type]
 
         def at(node: NodeId) -> Any:
             position = Position(node, SE3.identity(), np.eye(6))
             return SimpleNamespace(position=position, saved=None)
 
-        assert whereabouts.after(at(nodes[-1].id)) is None, "nothing with a place was seen yet"
-        assert whereabouts.after(at(nodes[0].id)) is not None
-        here = whereabouts.after(at(nodes[-1].id))
+        assert display_pose.after(at(nodes[-1].id)) is None, "nothing with a place was seen yet"
+        assert display_pose.after(at(nodes[0].id)) is not None
+        here = display_pose.after(at(nodes[-1].id))
         assert here is not None
         expected = frame.pose(nodes[-1].id).translation
         np.testing.assert_allclose(here.translation[:2], expected[:2], atol=0.5)

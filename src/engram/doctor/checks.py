@@ -448,7 +448,7 @@ def _agreeing(seen: Evidence) -> Array:
     """(M, 2) px: disparity and rows below the principal point, of matches that fit their pair."""
     middle = 0.0 if seen.camera is None else seen.camera.cy
     parts = [one.agreeing for one in _alignments(seen)]
-    both = [np.column_stack([one.shift[:, 0], one.pixels[:, 1] - middle]) for one in parts]
+    both = [np.column_stack([part.shift[:, 0], part.pixels[:, 1] - middle]) for part in parts]
     return np.concatenate([np.zeros((0, 2)), *both])
 
 

@@ -200,8 +200,8 @@ def rows_off(samples: list[SideMatches], camera: StereoCamera) -> float | None:
     Cells where no offset has a majority of the matches of all pairs do not count; None without
     any.
     """
-    pixels = np.concatenate([np.zeros((0, 2)), *(one.pixels for one in samples)])
-    offset = np.concatenate([np.zeros(0), *(one.shift[:, 1] for one in samples)])
+    pixels = np.concatenate([np.zeros((0, 2)), *(sample.pixels for sample in samples)])
+    offset = np.concatenate([np.zeros(0), *(sample.shift[:, 1] for sample in samples)])
     cells = (pixels[:, 0] * 4 // camera.width) * 3 + pixels[:, 1] * 3 // camera.height
     means = []
     for cell in np.unique(cells):

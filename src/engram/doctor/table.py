@@ -83,13 +83,13 @@ class Diagnosis:
     @property
     def fatal(self) -> tuple[Finding, ...]:
         """The findings for which the drive should not be mapped."""
-        return tuple(one for one in self.findings if one.severity is Severity.FATAL)
+        return tuple(finding for finding in self.findings if finding.severity is Severity.FATAL)
 
     def text(self) -> str:
         """For people."""
-        lines = [one.text() for one in self.findings]
+        lines = [finding.text() for finding in self.findings]
         lines += [f"not checked: {code} needs {needs}" for code, needs in self.untold.items()]
-        alarms = sum(one.severity is not Severity.NOTE for one in self.findings)
+        alarms = sum(finding.severity is not Severity.NOTE for finding in self.findings)
         found = (
             "nothing wrong"
             if not alarms
@@ -102,7 +102,7 @@ class Diagnosis:
         return {
             "frames": self.frames,
             "fatal": bool(self.fatal),
-            "findings": [plain(one) for one in self.findings],
+            "findings": [plain(finding) for finding in self.findings],
             "untold": self.untold,
         }
 

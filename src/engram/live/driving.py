@@ -20,10 +20,10 @@ from engram.localiser.localisation import Localisation, LocalisationStatus, Posi
 from engram.maps.map import Map, open_map
 from engram.odometry.motion import Motion
 from engram.odometry.outside import OutsideMotion
-from engram.robot.anchors import ToldFix
+from engram.robot.anchors import ReceiverFix
 from engram.robot.drive_session import RobotSetup, Saving, SavingState
 from engram.robot.front import Arrived, Front, at_time, stamp_of
-from engram.robot.robot import Robot, Whereabouts
+from engram.robot.robot import DisplayPose, Robot
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_in
 from engram.sequences.bags.fixes import Fix
@@ -159,14 +159,14 @@ class Driving:
         self._camera: StereoCamera | None = None
         self._front: tuple[DescriptorKind, Front] | None = None
         self._map: Map | None = None
-        self._whereabouts: Whereabouts | None = None
+        self._display_pose: DisplayPose | None = None
         self._robot: Robot | None = None
         self._saved = Saving()
         self._belief: Position | None = None
         # Whether the robot's position is one that it was only told.
         self._proposed = False
         self._outside: Outside | None = None
-        self._fix = ToldFix()
+        self._fix = ReceiverFix()
         self._open_after = -np.inf
 
     @property
@@ -204,10 +204,10 @@ class Driving:
             self.pause()
             self.trouble, self._open_after = str(error), self._now() + _AGAIN_AFTER_S
             time_ns = front.clock.expected_ns
-            taken = (one.motion for one in robot.track[-1:] if one.stamp_ns == time_ns)
+            taken = (result.motion for result in robot.track[-1:] if result.stamp_ns == time_ns)
             return Step(next(taken, None), trouble=self.trouble, time_ns=time_ns)
         self._belief = found.position
-        map_from_live = None if self._whereabouts is None else self._whereabouts.after(found)
+        map_from_live = None if self._display_pose is None else self._display_pose.after(found)
         if found.status is LocalisationStatus.LOCALISED or found.position is None or found.saved:
             self._proposed = False
         keeps_no_more = robot.saving.state in _KEEPS_NO_MORE
@@ -299,7 +299,7 @@ class Driving:
         self._proposed = False
         if self._front is not None and self._front[1].clock.shift_ns:
             self._front = self._outside = None  # times of the next drive are stamps again
-        opened, self._map, self._whereabouts = self._map, None, None
+        opened, self._map, self._display_pose = self._map, None, None
         self._open_after = -np.inf
         if robot is None or opened is None:
             return ""
@@ -332,7 +332,7 @@ class Driving:
             self.trouble, self._open_after = str(error), self._now() + _AGAIN_AFTER_S
             return None
         self._use_belief()
-        self._whereabouts = Whereabouts(self._map.frame, self._robot.graph)
+        self._display_pose = DisplayPose(self._map.frame, self._robot.graph)
         if self._watcher is not None:
             self._watcher.watch(self._robot, self._map)
         self.trouble = ""

@@ -167,12 +167,12 @@ class AcceptanceConfig:
     slack_rad: float = float(np.deg2rad(5.0))
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            value = getattr(self, one.name)
+        for field in fields(self):
+            value = getattr(self, field.name)
             if isinstance(value, Rule):
                 continue
             if not 0 <= value < np.inf:
-                raise ConfigError(f"acceptance: {one.name} is {value}, must be finite and >= 0")
+                raise ConfigError(f"acceptance: {field.name} is {value}, must be finite and >= 0")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

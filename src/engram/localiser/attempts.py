@@ -174,9 +174,9 @@ class Lanes:
     ) -> list[Match | None]:
         """See `Matcher`."""
         questions = [self._question(live_id, candidate) for candidate in candidates]
-        asked = [arguments(one, live) for one in questions if one is not None]
+        asked = [arguments(question, live) for question in questions if question is not None]
         found = iter(_core.attempt(features(live), asked, self._threads))
-        return [None if one is None else match_of(next(found)) for one in questions]
+        return [None if question is None else match_of(next(found)) for question in questions]
 
     def spread(self, live: Frame, live_id: NodeId, node: NodeId, match: Match) -> Spread:
         """See `Matcher`."""
@@ -359,7 +359,10 @@ def alternate(first: list[Candidate], second: list[Candidate]) -> list[Candidate
 
 def outcome_at(outcomes: Sequence[Outcome], node: NodeId | None) -> Outcome | None:
     """The accepted outcome of a node, as that of a result; None if there is none."""
-    return next((one for one in outcomes if one.accepted and one.candidate.node == node), None)
+    return next(
+        (outcome for outcome in outcomes if outcome.accepted and outcome.candidate.node == node),
+        None,
+    )
 
 
 def add_outcomes(
@@ -381,10 +384,10 @@ def add_outcomes(
         lenses: of the map's drives.
     """
     history.add(
-        [one.candidate.index for one in outcomes],
+        [outcome.candidate.index for outcome in outcomes],
         _foreseen(near, outcomes, basin, lenses),
-        [one.accepted for one in outcomes],
-        [one.match.inliers for one in outcomes],
+        [outcome.accepted for outcome in outcomes],
+        [outcome.match.inliers for outcome in outcomes],
         len(live.landmarks),
     )
 
@@ -430,7 +433,7 @@ def _foreseen(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(R,) distances, metres, and rates of success of attempts; NaN without a prediction."""
     distance_m, rates = np.full((2, len(outcomes)), np.nan)
-    predicted = [one.candidate.row for one in outcomes]
+    predicted = [outcome.candidate.row for outcome in outcomes]
     known = [at for at, row in enumerate(predicted) if row is not None]
     if near is None or not known:
         return distance_m, rates

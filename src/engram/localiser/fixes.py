@@ -56,7 +56,7 @@ from engram.localiser.acceptance import (
     plausible,
 )
 from engram.localiser.confidence import Evidence, Record, Standing, confidence_of
-from engram.localiser.localisation import Keeper, Position
+from engram.localiser.localisation import Position, ResultSink
 from engram.localiser.settings import HypothesesConfig, LocaliserConfig
 from engram.localiser.tracking import Track, seen_from
 from engram.localiser.yardstick import Likeness, Run, Yardstick, is_measured
@@ -228,17 +228,17 @@ class Hypotheses:
             one.position = one.position.carried_on(prev_from_curr, covariance)
             one.driven_m += prev_from_curr.distance_m
         self._waiting = [
-            one
-            for one in self._waiting
-            if one.driven_m <= self._config.forgotten_after_m
-            and one.position.sigma_m <= self._vague_m
+            hypothesis
+            for hypothesis in self._waiting
+            if hypothesis.driven_m <= self._config.forgotten_after_m
+            and hypothesis.position.sigma_m <= self._vague_m
         ]
 
     def nodes_near(self, count: int) -> list[int]:
         """Nodes, by dense index, that could confirm one: `count` for each, nearest first."""
         nodes: list[int] = []
-        for one in reversed(self._waiting):
-            near = self._search(one.position)
+        for hypothesis in reversed(self._waiting):
+            near = self._search(hypothesis.position)
             order = np.argsort(near.distance_m, kind="stable")[:count]
             nodes += [node for node in near.nodes[order].tolist() if node not in nodes]
         return nodes
@@ -256,7 +256,9 @@ class Hypotheses:
         found = [outcome for outcome in outcomes if outcome.plausible]
         if not found or any(outcome.accepted for outcome in outcomes):
             return outcomes
-        expected = [(one, self._predictions(one.position)) for one in self._waiting]
+        expected = [
+            (hypothesis, self._predictions(hypothesis.position)) for hypothesis in self._waiting
+        ]
         confirmed = []
         for outcome in found:
             agreeing = [one for one, near in expected if self._agree(outcome, near)]
@@ -297,9 +299,9 @@ def uncontested(outcomes: Sequence[Outcome], config: AcceptanceConfig) -> list[O
     In rain twenty inliers may agree by chance, a metre off. Often another match of the frame has
     nearly as many, lies elsewhere, and nearer to where odometry puts the robot.
     """
-    if len(outcomes) < 2 or not any(one.accepted for one in outcomes):
+    if len(outcomes) < 2 or not any(outcome.accepted for outcome in outcomes):
         return list(outcomes)
-    moved = [_correction(one) for one in outcomes]
+    moved = [_correction(outcome) for outcome in outcomes]
 
     def contested(at: int) -> bool:
         mine = moved[at]
@@ -333,8 +335,10 @@ def best_success(outcomes: Sequence[Outcome], rule: Rule) -> Outcome | None:
     """
     successes = [outcome for outcome in outcomes if outcome.accepted]
 
-    def least(one: Outcome) -> tuple[float, int]:
-        return -(one.confidence if rule is Rule.CONFIDENCE else one.match.inliers), one.rank
+    def least(outcome: Outcome) -> tuple[float, int]:
+        return -(
+            outcome.confidence if rule is Rule.CONFIDENCE else outcome.match.inliers
+        ), outcome.rank
 
     return min(successes, key=least, default=None)
 
@@ -425,7 +429,7 @@ class Fixes:
 
     Attributes:
         standing: of the position, when the frame began.
-        told_otherwise: whether a caller-supplied position contradicts the robot's own, and no fix
+        contradicted: whether a caller-supplied position contradicts the robot's own, and no fix
             has confirmed it yet.
         withdraws: stamps of the fixes that the frame's fix contradicts, ns.
         yardstick: what matches with the nodes of the map usually have.
@@ -454,7 +458,7 @@ class Fixes:
         )
         self.yardstick = Yardstick(graph, attempter.frame, config.matcher)
         self.standing = Standing()
-        self.told_otherwise = False
+        self.contradicted = False
         self.withdraws: tuple[int, ...] = ()
         self.lookalike: Outcome | None = None
         self._told = False
@@ -490,9 +494,9 @@ class Fixes:
         """Drops the matches that wait: the robot was found or carried elsewhere."""
         self._hypotheses.forget()
 
-    def forget(self, agreed: int = 0, *, told_otherwise: bool = False) -> None:
+    def forget(self, agreed: int = 0, *, contradicted: bool = False) -> None:
         """The position is another, confirmed by so many fixes; those before it stay."""
-        self.told_otherwise = told_otherwise and (self.told_otherwise or not self._told)
+        self.contradicted = contradicted and (self.contradicted or not self._told)
         self._told = not agreed
         self._record.forget(agreed)
         self._chain.settle()
@@ -535,7 +539,10 @@ class Fixes:
         if self._run.believed:
             return outcomes
         self.lookalike = best
-        return [replace(one, accepted=False) if one.accepted else one for one in outcomes]
+        return [
+            replace(outcome, accepted=False) if outcome.accepted else outcome
+            for outcome in outcomes
+        ]
 
     def _likeness(self, live: Frame, live_id: NodeId, outcome: Outcome) -> Likeness | None:
         """What the match shows; None if its node's drive saved no neighbour of the node."""
@@ -548,7 +555,7 @@ class Fixes:
             return None
         return Likeness.of(match, reference, live, usual, self._tracked)
 
-    def fix(self, live: Frame, success: Outcome, keeper: Keeper) -> None:
+    def fix(self, live: Frame, success: Outcome, result_sink: ResultSink) -> None:
         """Sets the position to that of a match, and checks it against earlier fixes.
 
         Of two that contradict, the weaker is withdrawn.
@@ -556,8 +563,8 @@ class Fixes:
         Args:
             live: the live frame.
             success: the accepted match.
-            keeper: has the distance driven since the nodes being saved lost their connection to the
-                map: a fix that nothing predicts reconnects them.
+            result_sink: has the distance driven since the nodes being saved lost their connection
+                to the map: a fix that nothing predicts reconnects them.
         """
         evidence, position, accepted = success.evidence, success.position, self._accepted
         assert evidence is not None
@@ -565,7 +572,7 @@ class Fixes:
         model = confidence_of(live.descriptor)
         before = self._chain.position or self._track.measured
         fits = True if predicted else self._agrees(position, before if certain else None)
-        share_m = 0.0 if fits else accepted.join_share * keeper.alone_m()
+        share_m = 0.0 if fits else accepted.join_share * result_sink.alone_m()
         joins_after_m = min(share_m, accepted.join_after_m)
         joins = joins_after_m > accepted.settle_after_m
         alone = model.alone(evidence)
@@ -574,7 +581,7 @@ class Fixes:
             self.withdraws = withdraws if fits is False else ()
         else:
             self._chain.join(live.stamp_ns, position, alone)
-        self._told = self.told_otherwise = False
+        self._told = self.contradicted = False
         # A robot that meets a node where it was saved has more inliers than elsewhere.
         inliers, usual = success.match.inliers, self.yardstick.usual(success.candidate.index)
         self._record.fixed(

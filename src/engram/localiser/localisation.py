@@ -233,7 +233,7 @@ class StageClock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hint:
-    """What a keeper contributes about a frame before it is localised.
+    """What a result sink contributes about a frame before it is localised.
 
     Attributes:
         position: where the robot is; None leaves it to the localiser.
@@ -252,16 +252,16 @@ class Hint:
     found: Localisation | None = None
 
 
-class Keeper:
+class ResultSink:
     """Keeps the results of a robot. This base class keeps nothing.
 
     For each frame the robot calls `hint`, then `keep`. It may later withdraw a match: it calls
-    `withdrawn` with the result of `keep`. A keeper holds back whatever a withdrawal would undo
+    `withdrawn` with the result of `keep`. A result sink holds back whatever a withdrawal would undo
     until a withdrawal is no longer possible.
     """
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
-        """The keeper's contribution before the frame is localised; `motion` led to it."""
+        """The result sink's contribution before the frame is localised; `motion` led to it."""
         del live, motion
         return None
 
@@ -280,16 +280,16 @@ class Keeper:
         """
         return 0.0
 
-    def keep(self, live: Frame, found: Localisation) -> Localisation:
+    def keep(self, live: Frame, result: Localisation) -> Localisation:
         """Keeps the result for a frame; returns it, completed by what was stored."""
         del live
-        return found
+        return result
 
-    def withdrawn(self, found: Localisation) -> None:
+    def withdrawn(self, result: Localisation) -> None:
         """A later frame disproved the match: treat the frame as not localised."""
 
     def finish(self) -> None:
         """The drive is over."""
 
 
-KEEPS_NOTHING = Keeper()
+NO_SINK = ResultSink()

@@ -43,12 +43,12 @@ from engram.localiser.attempts import (
 )
 from engram.localiser.fixes import Fixes, best_success
 from engram.localiser.localisation import (
-    KEEPS_NOTHING,
+    NO_SINK,
     Budget,
-    Keeper,
     Localisation,
     LocalisationStatus,
     Position,
+    ResultSink,
     StageClock,
 )
 from engram.localiser.relocalisation import Relocaliser
@@ -256,11 +256,11 @@ class Localiser:
     def best_matched(self) -> Frame | None:
         """The node's frame that the last one matched best, right or not; none of its own drive."""
         tried = [
-            one
-            for one in self._outcomes
-            if one.candidate.prediction is not None
-            and not one.damaged
-            and self._graph.node(one.candidate.index).session != self.live
+            outcome
+            for outcome in self._outcomes
+            if outcome.candidate.prediction is not None
+            and not outcome.damaged
+            and self._graph.node(outcome.candidate.index).session != self.live
         ]
         best = max(tried, key=lambda one: one.match.inliers, default=self._fixes.lookalike)
         return None if best is None else self._attempter.frame(best.candidate.node)
@@ -291,7 +291,7 @@ class Localiser:
             agreed: number of fixes that confirm it; 0 for a position that only the caller supplied.
             said: whether the caller supplied it, which may be wrong if the robot was certain.
         """
-        self._fixes.forget(agreed, told_otherwise=said and self.certain)
+        self._fixes.forget(agreed, contradicted=said and self.certain)
         self._track.set(position)
         if open_loop_m is not None:
             self._open_loop_m = open_loop_m
@@ -353,7 +353,7 @@ class Localiser:
         self,
         live: Frame,
         deadline: float | None = None,
-        keeper: Keeper = KEEPS_NOTHING,
+        result_sink: ResultSink = NO_SINK,
         clock: StageClock | None = None,
     ) -> Localisation:
         """One iteration of method §3: gather candidates, rank, attempt, settle.
@@ -361,7 +361,7 @@ class Localiser:
         Args:
             live: the live frame; `move` has been called with the motion that led to it.
             deadline: `time.perf_counter` value after which no attempt starts; None for no limit.
-            keeper: decides whether places beyond the neighbourhood may be tried.
+            result_sink: decides whether places beyond the neighbourhood may be tried.
             clock: measures the duration of each stage.
 
         Raises:
@@ -377,7 +377,7 @@ class Localiser:
             clock.lap("neighbourhood")
             order = self._rank(live, self._near)
             clock.lap("rank")
-            candidates = self._candidates(live, self._near, order, keeper, clock)
+            candidates = self._candidates(live, self._near, order, result_sink, clock)
             live_id = node_id(self.live, live.stamp_ns)
             for start in range(0, len(candidates), self._budget.lanes):
                 if deadline is not None and perf_counter() >= deadline:
@@ -393,29 +393,31 @@ class Localiser:
             outcomes = self._fixes.judged(live, live_id, self._driven_m, readable)
             clock.lap("attempts")
             add_outcomes(self._history, live, self._near, outcomes, self._basin, self._lenses)
-        success = self._conclude(live, outcomes, keeper)
+        success = self._conclude(live, outcomes, result_sink)
         clock.lap("remember")
         return self._result(live, success, clock.stage_ms)
 
-    def _conclude(self, live: Frame, outcomes: list[Outcome], keeper: Keeper) -> Outcome | None:
+    def _conclude(
+        self, live: Frame, outcomes: list[Outcome], result_sink: ResultSink
+    ) -> Outcome | None:
         """Sets the position to that of the best match; without one, reports the failures."""
         self._outcomes = outcomes
         self._reference = None if self.position is None else self.position.node
         success = best_success(outcomes, self.config.acceptance.rule)
         if success is not None:
-            self._fixes.fix(live, success, keeper)
+            self._fixes.fix(live, success, result_sink)
             self._open_loop_m = 0.0
             if self._relocaliser is not None:
                 self._relocaliser.forget()
             return success
-        if any(one.candidate.row is not None for one in outcomes):
+        if any(outcome.candidate.row is not None for outcome in outcomes):
             self._fixes.missed()
         if self._relocaliser is not None:
             self._relocaliser.failed(
                 [
-                    one.candidate.index
-                    for one in outcomes
-                    if one.candidate.prediction is None and not one.plausible
+                    outcome.candidate.index
+                    for outcome in outcomes
+                    if outcome.candidate.prediction is None and not outcome.plausible
                 ]
             )
         return None
@@ -539,7 +541,7 @@ class Localiser:
         live: Frame,
         neighbourhood: Neighbourhood | None,
         order: NDArray[np.int64],
-        keeper: Keeper,
+        result_sink: ResultSink,
         clock: StageClock,
     ) -> list[Candidate]:
         """What to attempt, best first.
@@ -560,11 +562,13 @@ class Localiser:
             ][:budget]
         if (ranked and not self._looks_elsewhere) or self._relocaliser is None:
             return ranked
-        if not keeper.may_propose():
+        if not result_sink.may_propose():
             return ranked
         known = {candidate.index for candidate in ranked}
         budget = self._budget.lost_attempts
-        indices = self._fixes.nodes_to_confirm(_CONFIRMING) + self._proposals(live, budget, keeper)
+        indices = self._fixes.nodes_to_confirm(_CONFIRMING) + self._proposals(
+            live, budget, result_sink
+        )
         proposed = [
             Candidate(
                 index,
@@ -581,11 +585,11 @@ class Localiser:
         clock.lap("places")
         return alternate(proposed, ranked)[:budget]
 
-    def _proposals(self, live: Frame, count: int, keeper: Keeper) -> list[int]:
+    def _proposals(self, live: Frame, count: int, result_sink: ResultSink) -> list[int]:
         """The relocaliser's nodes, without known ones of this session."""
         assert self._relocaliser is not None
         self._looked_up = True
-        own = keeper.may_propose_own()
+        own = result_sink.may_propose_own()
         return self._relocaliser.propose(
             live,
             count,
@@ -624,12 +628,12 @@ class Localiser:
         return [outcome for outcome in outcomes if not outcome.damaged]
 
     @property
-    def told_otherwise(self) -> bool:
+    def contradicted(self) -> bool:
         """Whether a caller-supplied position contradicts the robot's own.
 
         No edge is created until a fix confirms it.
         """
-        return self._fixes.told_otherwise
+        return self._fixes.contradicted
 
     @property
     def on_trial(self) -> bool:
@@ -662,7 +666,7 @@ class Localiser:
             covariance=None if best is None else best.covariance,
             measured=self.position,
             inliers=0 if success is None else success.match.inliers,
-            confidence=max((one.confidence for one in self._outcomes), default=-math.inf)
+            confidence=max((outcome.confidence for outcome in self._outcomes), default=-math.inf)
             if success is None
             else success.confidence,
             stage_ms=stage_ms,

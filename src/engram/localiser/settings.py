@@ -199,10 +199,10 @@ class LocaliserConfig:
     lookalikes: LookalikeConfig = field(default_factory=LookalikeConfig)
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            value = getattr(self, one.name)
+        for setting in fields(self):
+            value = getattr(self, setting.name)
             if isinstance(value, float) and not 0 <= value < np.inf:
-                raise ConfigError(f"localiser: {one.name} is {value}, must be finite and >= 0")
+                raise ConfigError(f"localiser: {setting.name} is {value}, must be finite and >= 0")
         for name in ("lost_max_samples", "lost_max_hypotheses"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"localiser: {name} is {getattr(self, name)}, must be >= 1")

@@ -202,23 +202,25 @@ class LoopSearch:
     def _confirmed(self, match: _Match) -> list[_Match]:
         """The match and the waiting ones that agree with it; none if it must wait itself."""
         here_m, within_m = self._driven_m(match.edge), self.config.confirm_within_m
-        passed_m = {one: here_m - self._driven_m(one.edge) for one in self._waiting}
+        passed_m = {
+            hypothesis: here_m - self._driven_m(hypothesis.edge) for hypothesis in self._waiting
+        }
         self._waiting = [
             one for one, m in passed_m.items() if m <= self._base_line_m(one) + within_m
         ]
         agreeing = [
-            one
-            for one in self._waiting
-            if passed_m[one] >= self._base_line_m(one)
-            and one.alike + match.alike <= 0
+            hypothesis
+            for hypothesis in self._waiting
+            if passed_m[hypothesis] >= self._base_line_m(hypothesis)
+            and hypothesis.alike + match.alike <= 0
             and edges_agree(
-                self._graph, one.edge, match.edge, self._acceptance, self.config.certain_m
+                self._graph, hypothesis.edge, match.edge, self._acceptance, self.config.certain_m
             )
         ]
         if not agreeing:
             self._waiting.append(match)
             return []
-        self._waiting = [one for one in self._waiting if one not in agreeing]
+        self._waiting = [hypothesis for hypothesis in self._waiting if hypothesis not in agreeing]
         return [*agreeing, match]
 
     def _base_line_m(self, match: _Match) -> float:

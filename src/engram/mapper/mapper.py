@@ -40,7 +40,13 @@ from engram.graph.proximity import ProximityConfig, lay_proximity_edges, tighten
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
 from engram.localiser.attempts import Outcome
 from engram.localiser.fixes import MOST_ON_TRIAL
-from engram.localiser.localisation import Hint, Keeper, Localisation, LocalisationStatus, Position
+from engram.localiser.localisation import (
+    Hint,
+    Localisation,
+    LocalisationStatus,
+    Position,
+    ResultSink,
+)
 from engram.localiser.localiser import Localiser
 from engram.mapper.loops import LoopSearch
 from engram.maps.records import StoredSession
@@ -203,7 +209,7 @@ _RESUMED_SIGMA_M = 3.0
 _RESUMED_SIGMA_RAD = float(np.deg2rad(20.0))
 
 
-class Memory(Keeper):
+class Memory(ResultSink):
     """Remembers a drive without saving a node: its path and its attempts.
 
     The policies `path` and `recall` use them in later drives. What fixes on trial add is held back:
@@ -231,7 +237,7 @@ class Memory(Keeper):
             localiser.resume(0.0, stored.next_iteration)
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
-        """See `Keeper`: frames of an interrupted run are not localised again."""
+        """See `ResultSink`: frames of an interrupted run are not localised again."""
         if not self._is_stored(live.stamp_ns):
             return None
         assert self._stored is not None
@@ -244,21 +250,21 @@ class Memory(Keeper):
         )
         return Hint(position, guessed_m=np.inf, found=followed)
 
-    def keep(self, live: Frame, found: Localisation) -> Localisation:
-        """See `Keeper`."""
-        if not found.resumed:
+    def keep(self, live: Frame, result: Localisation) -> Localisation:
+        """See `ResultSink`."""
+        if not result.resumed:
             records = Records(
-                live.stamp_ns, attempts=self._localiser.attempts(), visit=match_of(found)
+                live.stamp_ns, attempts=self._localiser.attempts(), visit=match_of(result)
             )
             self._saver.put(records, self._held_back)
-        return found
+        return result
 
-    def withdrawn(self, found: Localisation) -> None:
-        """See `Keeper`: the frame was not localised, and its attempts failed."""
-        self._saver.withdraw(found.stamp_ns)
+    def withdrawn(self, result: Localisation) -> None:
+        """See `ResultSink`: the frame was not localised, and its attempts failed."""
+        self._saver.withdraw(result.stamp_ns)
 
     def finish(self) -> None:
-        """See `Keeper`: what is still held back is kept."""
+        """See `ResultSink`: what is still held back is kept."""
         self._saver.put(Records())
 
     @property
@@ -272,9 +278,9 @@ class Memory(Keeper):
         return last_ns is not None and stamp_ns <= last_ns
 
 
-def match_of(found: Localisation) -> tuple[NodeId, PathEntryKind] | None:
+def match_of(result: Localisation) -> tuple[NodeId, PathEntryKind] | None:
     """The visit of a localised frame; None for another."""
-    return None if found.node is None else (found.node, PathEntryKind.MATCHED)
+    return None if result.node is None else (result.node, PathEntryKind.MATCHED)
 
 
 def match_edges(
@@ -405,11 +411,11 @@ class EdgeVotes:
                 self._distrust(row, stamp_ns)
 
     def _sure(self, outcomes: Sequence[Outcome]) -> Iterator[tuple[int, Position]]:
-        for one in outcomes:
-            pose, covariance = one.match.reference_from_live, one.match.covariance
-            if pose is None or covariance is None or one.match.inliers < self.config.inliers:
+        for outcome in outcomes:
+            pose, covariance = outcome.match.reference_from_live, outcome.match.covariance
+            if pose is None or covariance is None or outcome.match.inliers < self.config.inliers:
                 continue
-            yield one.match.inliers, Position(one.candidate.node, pose, covariance)
+            yield outcome.match.inliers, Position(outcome.candidate.node, pose, covariance)
 
     def _contradicts(self, edge: Edge, tree: ChainTree, goal: int) -> bool:
         pose = tree.pose(goal)
@@ -529,7 +535,7 @@ class Mapper(Memory):
         self.removals = self.votes.removals
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
-        """See `Keeper`: closes the loops found so far before the frame is localised."""
+        """See `ResultSink`: closes the loops found so far before the frame is localised."""
         self._move_on(motion)
         followed = super().hint(live, motion)
         if followed is not None:
@@ -538,7 +544,7 @@ class Mapper(Memory):
         return None
 
     def may_propose(self) -> bool:
-        """See `Keeper`.
+        """See `ResultSink`.
 
         A robot whose nodes are connected to the map is not lost, however far it drifts: loop
         closure runs during the drive.
@@ -546,48 +552,48 @@ class Mapper(Memory):
         return not self._localiser.certain or self._loops is None or not self._joined
 
     def may_propose_own(self) -> bool:
-        """See `Keeper`."""
+        """See `ResultSink`."""
         return not self._localiser.certain or self._loops is None
 
     def alone_m(self) -> float:
-        """See `Keeper`."""
+        """See `ResultSink`."""
         return 0.0 if self._joined else self._localiser.driven_m - self._alone_from_m
 
-    def keep(self, live: Frame, found: Localisation) -> Localisation:
+    def keep(self, live: Frame, result: Localisation) -> Localisation:
         """Saves a frame that did not match, or weakly; ties experiences to their neighbours.
 
         Raises:
             MapError: an earlier frame could not be written.
         """
-        if found.resumed:
-            return found
-        edges = self._closures + self._proved(found)
+        if result.resumed:
+            return result
+        edges = self._closures + self._proved(result)
         saved: Node | None = None
-        visit = match_of(found)
-        if found.localised:
-            edges += self._join(found)
-        if self._looks_new(found) and self._worth_saving(live, found.motion):
-            save = self._save_matched if found.localised else self._save
-            saved, laid = save(live, found.measured)
+        visit = match_of(result)
+        if result.localised:
+            edges += self._join(result)
+        if self._looks_new(result) and self._worth_saving(live, result.motion):
+            save = self._save_matched if result.localised else self._save
+            saved, laid = save(live, result.measured)
             edges += laid
             visit = saved.id, PathEntryKind.SAVED
         frame, attempts = live if saved else None, self._localiser.attempts()
         records = Records(live.stamp_ns, saved, frame, edges, attempts, visit)
         self._saver.put(records, self._held_back)
         if saved is None:
-            return found
+            return result
         if self._loops is not None:
             self._loops.ask(saved, live)
-        return replace(found, saved=saved.id)
+        return replace(result, saved=saved.id)
 
-    def withdrawn(self, found: Localisation) -> None:
-        """See `Keeper`: no edge rests on the match."""
-        super().withdrawn(found)
+    def withdrawn(self, result: Localisation) -> None:
+        """See `ResultSink`: no edge rests on the match."""
+        super().withdrawn(result)
         self._waiting.clear()
 
-    def _proved(self, found: Localisation) -> list[Edge]:
+    def _proved(self, result: Localisation) -> list[Edge]:
         """Edges that waited for their fixes; dropped if the robot is lost before these agree."""
-        if self._localiser.on_trial and found.status is not LocalisationStatus.LOST:
+        if self._localiser.on_trial and result.status is not LocalisationStatus.LOST:
             return []
         waiting = list(self._waiting.values())
         self._waiting.clear()
@@ -604,25 +610,25 @@ class Mapper(Memory):
         """Holds edges back; a robot that stands measures the same ones again and again."""
         self._waiting |= {(edge.a, edge.b, edge.kind): edge for edge in edges}
 
-    def _join(self, found: Localisation) -> list[Edge]:
+    def _join(self, result: Localisation) -> list[Edge]:
         """Ties the experience to the matched node, and the matched nodes to each other."""
         matched = match_edges(
             self._graph, self._localiser.outcomes, self._localiser.config.acceptance
         )
         if self._localiser.on_trial:
             if not self._waiting and self._experience and self._since_saved is not None:
-                assert found.measured is not None
-                matched.append(edge_through_live(self._since_saved, found.measured, EdgeKind.TIE))
+                assert result.measured is not None
+                matched.append(edge_through_live(self._since_saved, result.measured, EdgeKind.TIE))
             self._wait_with(matched)
             return []
-        self.votes.count(found.stamp_ns, self._localiser.outcomes)
+        self.votes.count(result.stamp_ns, self._localiser.outcomes)
         self._joined = True
-        edges = self._end_experience(found)
+        edges = self._end_experience(result)
         self._graph.add_edges(matched)
         return edges + matched
 
     def finish(self) -> None:
-        """See `Keeper`: waits for the lookups of the last saved nodes.
+        """See `ResultSink`: waits for the lookups of the last saved nodes.
 
         Raises:
             MapError: an earlier frame could not be written.
@@ -657,11 +663,11 @@ class Mapper(Memory):
                 motion.prev_from_curr, motion.covariance
             )
 
-    def _looks_new(self, found: Localisation) -> bool:
+    def _looks_new(self, result: Localisation) -> bool:
         """Whether the frame's view is new to the map; a match on trial does not decide that."""
-        if not found.localised:
+        if not result.localised:
             return True
-        return found.inliers < self.config.sure_inliers and not self._localiser.on_trial
+        return result.inliers < self.config.sure_inliers and not self._localiser.on_trial
 
     def _worth_saving(self, live: Frame, motion: Motion) -> bool:
         """Whether a frame is usable and far enough from the last saved one (method §5).
@@ -682,7 +688,7 @@ class Mapper(Memory):
         """Saves the frame as a node, chained to the experience or tied to where it began."""
         node = self._node_of(live)
         edges = []
-        unknown = self._localiser.told_otherwise
+        unknown = self._localiser.contradicted
         if self._since_saved is None or unknown:
             self._joined = len(self._graph) == 1  # motion from earlier nodes is unknown
             self._alone_from_m = self._localiser.driven_m

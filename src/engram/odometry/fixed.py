@@ -553,8 +553,8 @@ def _some(frame: Frame, chosen: NDArray[np.bool_]) -> Frame:
         frame,
         landmarks=Landmarks(
             *(
-                np.ascontiguousarray(getattr(landmarks, one.name)[chosen])
-                for one in fields(Landmarks)
+                np.ascontiguousarray(getattr(landmarks, field.name)[chosen])
+                for field in fields(Landmarks)
             )
         ),
     )

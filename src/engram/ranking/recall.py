@@ -349,7 +349,7 @@ class RecallPolicy:
 def _bound(constants: RecallConstants) -> _core.RecallConstants:
     """The constants for the core, without `per_m`, which depends on the focal length."""
     bound = _core.RecallConstants()
-    for one in fields(constants):
-        if hasattr(bound, one.name):  # the core uses neither similarity nor probabilities
-            setattr(bound, one.name, getattr(constants, one.name))
+    for field in fields(constants):
+        if hasattr(bound, field.name):  # the core uses neither similarity nor probabilities
+            setattr(bound, field.name, getattr(constants, field.name))
     return bound

@@ -286,7 +286,7 @@ class LatestFix:
         return None if latest is None or time_ns - latest.time_ns > _APART_NS else latest
 
 
-class ToldFix:
+class ReceiverFix:
     """Latest fix of the robot's GNSS receiver."""
 
     def __init__(self) -> None:
@@ -544,16 +544,23 @@ def _check_spread(positions: NDArray[np.float64], source: Path) -> None:
 
 def _anchored(store: Map, anchors: list[Anchor]) -> Anchored:
     return Anchored(
-        np.array([store.graph.index(one.node) for one in anchors], np.int64),
-        np.array([(one.x_m, one.y_m, np.nan if one.z_m is None else one.z_m) for one in anchors]),
-        np.array([one.sigma_m for one in anchors]),
+        np.array([store.graph.index(anchor.node) for anchor in anchors], np.int64),
+        np.array(
+            [
+                (anchor.x_m, anchor.y_m, np.nan if anchor.z_m is None else anchor.z_m)
+                for anchor in anchors
+            ]
+        ),
+        np.array([anchor.sigma_m for anchor in anchors]),
     )
 
 
 def _residuals(frame: MapFrame, anchors: list[Anchor]) -> dict[str, float]:
     return {
-        str(one.node): float(np.hypot(*(frame.pose(one.node).translation[:2] - (one.x_m, one.y_m))))
-        for one in anchors
+        str(anchor.node): float(
+            np.hypot(*(frame.pose(anchor.node).translation[:2] - (anchor.x_m, anchor.y_m)))
+        )
+        for anchor in anchors
     }
 
 
@@ -571,8 +578,8 @@ def _write(
 ) -> int:
     origin = frame.origin
     with store.begin_revision(**about) as writer:
-        for one in anchors:
-            writer.add_mark(one)
+        for anchor in anchors:
+            writer.add_mark(anchor)
         for placement in changed(store.placements, store.graph, frame.poses, placing.same_m):
             writer.add_mark(placement)
         if origin is not None:

@@ -26,7 +26,7 @@ from engram.graph.model import Clock, NodeId, PathEntry, Removal, Session, Sessi
 from engram.graph.placing import PlacingConfig
 from engram.localiser.acceptance import Rule
 from engram.localiser.attempts import Attempter, Lanes
-from engram.localiser.localisation import KEEPS_NOTHING, Keeper
+from engram.localiser.localisation import NO_SINK, ResultSink
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser
 from engram.localiser.relocalisation import ByAppearance, Relocaliser, Suggested
 from engram.localiser.yardstick import Yardstick
@@ -210,20 +210,20 @@ class DriveSession:
     """One drive that is being saved, on its own thread. Made by `mapped` and `remembered`.
 
     Attributes:
-        keeper: the drive's keeper.
+        result_sink: takes the drive's results.
         localiser: the drive's localiser.
     """
 
     def __init__(
         self,
         localiser: Localiser,
-        keeper: Memory,
+        result_sink: Memory,
         saver: Saver,
         sink: RevisionSink | Spool,
         loops: AbstractContextManager[object] | None = None,
     ) -> None:
         self.localiser = localiser
-        self.keeper = keeper
+        self.result_sink = result_sink
         self._saver = saver
         self._sink = sink
         self._loops = nullcontext() if loops is None else loops
@@ -255,8 +255,8 @@ class DriveSession:
         saver = Saver(
             sink, path_id(session.id), mapper.checkpoint_every, waits=waits, last=stored.last_entry
         )
-        keeper = Mapper(localiser.graph, localiser, saver, session, mapper, loops, stored)
-        return DriveSession(localiser, keeper, saver, sink, loops)
+        result_sink = Mapper(localiser.graph, localiser, saver, session, mapper, loops, stored)
+        return DriveSession(localiser, result_sink, saver, sink, loops)
 
     @staticmethod
     def remembered(
@@ -283,7 +283,7 @@ class DriveSession:
         Raises:
             MapError: an earlier frame could not be written.
         """
-        self.keeper.finish()
+        self.result_sink.finish()
 
     def close(self) -> None:
         """Writes what is queued, and ends the threads. A mapped session can be resumed.
@@ -304,7 +304,7 @@ class DriveSession:
             MapLockedError: another process writes to the map: the spool waits.
             MapError: it cannot be written.
         """
-        return self._sink.commit(self.keeper.removals)
+        return self._sink.commit(self.result_sink.removals)
 
     def leave(self) -> None:
         """Leaves the drive uncommitted: a mapped one for ``engram check --seal``, no other."""
@@ -390,7 +390,7 @@ def commit_crashed(opened: Map, robot: str, settings: Settings) -> tuple[int, ..
         MapError: it cannot be written.
     """
     waiting = [one for one in opened.interrupted() if one.live and one.pid]
-    mine = [one.session.id for one in waiting if one.session.robot == robot]
+    mine = [hypothesis.session.id for hypothesis in waiting if hypothesis.session.robot == robot]
     if not mine:
         return ()
     numbers = []
@@ -438,8 +438,8 @@ def loop_search(opened: Map, localiser: Localiser, settings: Settings) -> LoopSe
 class LiveDrive:
     """A live drive: begun by its first frame, kept until an error or the doctor ends that.
 
-    Nothing here forwards to the keeper: the robot asks the one that each method returns, and after
-    a write error or an unfit drive that is one that keeps nothing.
+    Nothing here forwards to the result sink: the robot asks the one that each method returns, and
+    after a write error or an unfit drive that is one that keeps nothing.
 
     Args:
         setup: the robot.
@@ -465,21 +465,21 @@ class LiveDrive:
             self.localiser = setup.localiser_in(opened, maps=maps, remembers=not maps)
             self._stack = stack.pop_all()
 
-    def begin(self, first: Arrived) -> Keeper:
-        """Begins the drive with this pair or logged frame; returns its keeper."""
-        session, keeper = self._setup.session_from(first), KEEPS_NOTHING
+    def begin(self, first: Arrived) -> ResultSink:
+        """Begins the drive with this pair or logged frame; returns its result sink."""
+        session, result_sink = self._setup.session_from(first), NO_SINK
         self.saving.session = session.id
         try:
             if self.saving.state is not SavingState.FAILED:
                 self._session = self._begun(session, first)
-                keeper = self._session.keeper
+                result_sink = self._session.result_sink
         except MapError as error:
-            keeper = self.failed(error)
+            result_sink = self.failed(error)
         if self.saving.state is SavingState.FAILED:
             # The map may hold this very drive: its nodes are then not the robot's own.
             session = replace(session, id=UNNAMED_LIVE_SESSION)
         self.localiser.begin(session)
-        return keeper
+        return result_sink
 
     def _begun(self, session: Session, first: Arrived) -> DriveSession:
         setup, settings, opened = self._setup, self._setup.settings, self._opened
@@ -493,25 +493,25 @@ class LiveDrive:
             opened, writer, self.localiser, settings, self._words, waits=False
         )
 
-    def failed(self, error: MapError) -> Keeper:
-        """A write failed: ends the saving, not the drive; returns the keeper from now on."""
+    def failed(self, error: MapError) -> ResultSink:
+        """A write failed: ends the saving, not the drive; returns the result sink from now on."""
         self.saving.state, self.saving.reason = SavingState.FAILED, str(error)
-        return KEEPS_NOTHING
+        return NO_SINK
 
-    def examined(self, fatal: Sequence[Finding], keeper: Keeper) -> Keeper:
-        """The keeper from now on: a drive that the doctor found unfit is not committed.
+    def examined(self, fatal: Sequence[Finding], result_sink: ResultSink) -> ResultSink:
+        """The result sink from now on: a drive that the doctor found unfit is not committed.
 
         Args:
             fatal: what it found.
-            keeper: the keeper until now.
+            result_sink: the one until now.
         """
         if not fatal or self._setup.options.force or self.saving.state is not SavingState.ON:
-            return keeper
+            return result_sink
         try:
             self._leave(fatal)
         except MapError as error:
             return self.failed(error)
-        return KEEPS_NOTHING
+        return NO_SINK
 
     def close(self, fatal: Sequence[Finding] = ()) -> None:
         """Ends the drive and commits it as a revision, unless the doctor found it unfit.
@@ -557,7 +557,7 @@ class LiveDrive:
             session.leave()
         if self.saving.state is not SavingState.FAILED:
             self.saving.state = SavingState.UNCOMMITTED
-            self.saving.reason = "; ".join(one.message for one in fatal)
+            self.saving.reason = "; ".join(finding.message for finding in fatal)
 
     def _ended(self) -> DriveSession | None:
         """The session, once all that it saved is written; None if none has begun."""

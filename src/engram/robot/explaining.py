@@ -135,7 +135,7 @@ class Explanation:
             "status": self.status.value,
             "meaning": self.meaning,
             "rule": self.rule,
-            "candidates": [one.to_dict() for one in self.candidates],
+            "candidates": [candidate.to_dict() for candidate in self.candidates],
         }
 
 
@@ -197,12 +197,12 @@ def explain_frame(
 def _explained(
     opened: Map,
     options: ExplainOptions,
-    found: Localisation,
+    result: Localisation,
     watching: _Watching,
     attempted: set[int],
 ) -> Explanation:
     if watching.asked is None:
-        return Explanation(options.frame, found.stamp_ns, options.ranking, found.status)
+        return Explanation(options.frame, result.stamp_ns, options.ranking, result.status)
     context, order, reasons, foreseen = watching.asked
     near, rates = context.neighbourhood, context.success_rates()
     drives = _drives(opened)
@@ -229,9 +229,9 @@ def _explained(
         )
     return Explanation(
         options.frame,
-        found.stamp_ns,
+        result.stamp_ns,
         options.ranking,
-        found.status,
+        result.status,
         reasons.meaning,
         reasons.rule,
         tuple(candidates),

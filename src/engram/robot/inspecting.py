@@ -159,7 +159,8 @@ def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:
     return {
         "sound": not problems,
         "problems": [
-            {"table": one.table, "record": one.record, "fact": one.fact} for one in problems
+            {"table": problem.table, "record": problem.record, "fact": problem.fact}
+            for problem in problems
         ],
         "rows": report.rows,
         "blobs": report.blobs,

@@ -214,7 +214,7 @@ def refuse_unfit(diagnosis: Diagnosis, name: str, options: RobotOptions) -> None
         UnfitDriveError: what is wrong with it.
     """
     if diagnosis.fatal and not options.force:
-        findings = "\n".join(one.text() for one in diagnosis.fatal)
+        findings = "\n".join(finding.text() for finding in diagnosis.fatal)
         raise UnfitDriveError(
             f"{name}: not mapped, nothing was written; --force maps it anyway\n{findings}"
         )
@@ -249,7 +249,7 @@ class MapReport:
     @property
     def saved(self) -> int:
         """Nodes added."""
-        return sum(one.saved is not None for one in self.results)
+        return sum(result.saved is not None for result in self.results)
 
     def to_dict(self) -> dict[str, Any]:
         """What ``map --json`` prints."""
@@ -396,7 +396,7 @@ def _save(
     finder = relocaliser_with_fixes(opened, sequence, settings, relocaliser)
     localiser = replace(setup, relocaliser=finder).localiser_in(opened, maps=True)
     saved = DriveSession.mapped(opened, writer, localiser, settings, words)
-    robot = Robot(front, localiser, saved.keeper, deadline_ms=setup.options.deadline_ms)
+    robot = Robot(front, localiser, saved.result_sink, deadline_ms=setup.options.deadline_ms)
     begin(Beginning(opened, robot, report.resumed))
     try:
         with robot, closing(robot.drive(drive, monitor)) as results:

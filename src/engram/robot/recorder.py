@@ -122,7 +122,7 @@ class Recorder:
         self.folder, self.about = Path(self.folder), plain(self.about)
 
     def note(
-        self, arrived: Arrived, frame: Frame, found: Localisation, outcomes: list[Outcome]
+        self, arrived: Arrived, frame: Frame, result: Localisation, outcomes: list[Outcome]
     ) -> None:
         """Keeps one frame; writes a record if the robot has just been lost.
 
@@ -136,12 +136,12 @@ class Recorder:
         pair = None
         if isinstance(arrived, StereoPair):
             pair = (arrived.left.copy(), arrived.right.copy())
-        self._put((LoggedFrame(frame, found.motion.odometry), pair, _decision(found, outcomes)))
-        lost = found.status in _LOST
+        self._put((LoggedFrame(frame, result.motion.odometry), pair, _decision(result, outcomes)))
+        lost = result.status in _LOST
         if lost and self._knew:
             self._write_unasked("lost")
-        if found.localised or lost:
-            self._knew = found.localised
+        if result.localised or lost:
+            self._knew = result.localised
 
     def withdrew(self) -> None:
         """Writes a record: the robot withdrew a fix."""
@@ -155,7 +155,7 @@ class Recorder:
         """
         stamp = datetime.fromtimestamp(self._stamp_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S")
         names = (self.folder / f"{self.info.name}-{stamp}-{n}.flight" for n in count(1))
-        path = next(one for one in names if one not in self._asked and not one.exists())
+        path = next(name for name in names if name not in self._asked and not name.exists())
         self._asked.add(path)
         self._start()
         self._queue.put(_Request(path, reason, {**self.about, "stamp_ns": self._stamp_ns}))
@@ -268,15 +268,15 @@ class Recorder:
         return cv2.imencode(".jpg", image, quality)[1].tobytes()
 
 
-def _decision(found: Localisation, outcomes: list[Outcome]) -> dict[str, Any]:
+def _decision(result: Localisation, outcomes: list[Outcome]) -> dict[str, Any]:
     """What the robot concluded from a frame, and from what."""
-    position = found.position
+    position = result.position
     return {
-        **found.to_dict(),
-        "looked_up": found.looked_up,
-        "moved_m": found.motion.moved_m,
-        "guessed_m": _finite(found.motion.guessed_m),
-        "jumped": found.motion.jumped,
+        **result.to_dict(),
+        "looked_up": result.looked_up,
+        "moved_m": result.motion.moved_m,
+        "guessed_m": _finite(result.motion.guessed_m),
+        "jumped": result.motion.jumped,
         "belief": None
         if position is None
         else {
@@ -286,11 +286,11 @@ def _decision(found: Localisation, outcomes: list[Outcome]) -> dict[str, Any]:
         },
         "tried": [
             {
-                "node": str(one.candidate.node),
-                "inliers": one.match.inliers,
-                "accepted": bool(one.accepted),
+                "node": str(outcome.candidate.node),
+                "inliers": outcome.match.inliers,
+                "accepted": bool(outcome.accepted),
             }
-            for one in outcomes[:_ATTEMPTS]
+            for outcome in outcomes[:_ATTEMPTS]
         ],
     }
 

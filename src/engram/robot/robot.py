@@ -22,11 +22,11 @@ from engram.graph.model import NodeId
 from engram.graph.placing import MAP_FROM_CAMERA
 from engram.localiser.attempts import Outcome
 from engram.localiser.localisation import (
-    KEEPS_NOTHING,
-    Keeper,
+    NO_SINK,
     Localisation,
     LocalisationStatus,
     Position,
+    ResultSink,
     StageClock,
 )
 from engram.localiser.localiser import InForce, Localiser
@@ -48,7 +48,7 @@ _REMEMBERED = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class LastFrame:
     """The robot's last frame, for display.
 
     Attributes:
@@ -74,8 +74,8 @@ class Robot:
     Args:
         front: front-end and odometry.
         localiser: localiser of this drive.
-        keeper: keeps the results.
-        live: the live drive, which gives the keeper from its first frame on; None if it is not one.
+        result_sink: keeps the results.
+        live: the live drive, which gives the result sink from its first frame on; None for others.
         deadline_ms: latest start of an attempt after its frame arrived; None for no limit.
     """
 
@@ -83,15 +83,15 @@ class Robot:
         self,
         front: Front,
         localiser: Localiser,
-        keeper: Keeper = KEEPS_NOTHING,
+        result_sink: ResultSink = NO_SINK,
         *,
         live: LiveDrive | None = None,
         deadline_ms: float | None = None,
     ) -> None:
-        self.last: Seen | None = None
+        self.last: LastFrame | None = None
         # Why nothing that the robot says is to be trusted, once the doctor has seen enough frames.
         self.unfit: tuple[Finding, ...] = ()
-        self._keeper = keeper
+        self._result_sink = result_sink
         self._live = live
         self._front = front
         self._clock = front.clock
@@ -108,7 +108,7 @@ class Robot:
         self._closed = False
         self.recorder: Recorder | None = None
         # Called after each step with the frame and its result, such as by a viewer.
-        self.watch: Callable[[Seen, Localisation], None] | None = None
+        self.watch: Callable[[LastFrame, Localisation], None] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -214,7 +214,7 @@ class Robot:
             try:
                 found = self._known(frame, motion)
                 if found is None:
-                    found = self._localiser.localise(frame, deadline, self._keeper, clock)
+                    found = self._localiser.localise(frame, deadline, self._result_sink, clock)
                 for earlier in self.track if found.withdraws else ():
                     if earlier.stamp_ns in found.withdraws:
                         self._withdraw(earlier)
@@ -227,7 +227,7 @@ class Robot:
             if self._front.fixed_share:
                 found = replace(found, fixed_share=self._front.fixed_share)
             self._front.match_again(frame, self._localiser.best_matched)
-            self.last = Seen(arrived, frame, self._localiser.outcomes)
+            self.last = LastFrame(arrived, frame, self._localiser.outcomes)
             if self.watch is not None:
                 self.watch(self.last, found)
             if self.recorder is not None:
@@ -238,12 +238,12 @@ class Robot:
 
     localise = step
 
-    def _with_stamps(self, found: Localisation, stamp_ns: int) -> Localisation:
+    def _with_stamps(self, result: Localisation, stamp_ns: int) -> Localisation:
         """A result with the stamps of its frames in place of times."""
         if not self._clock.steps:
-            return found
-        withdraws = tuple(map(self._clock.stamp_of, found.withdraws))
-        return replace(found, stamp_ns=stamp_ns, withdraws=withdraws)
+            return result
+        withdraws = tuple(map(self._clock.stamp_of, result.withdraws))
+        return replace(result, stamp_ns=stamp_ns, withdraws=withdraws)
 
     def drive(
         self,
@@ -326,24 +326,24 @@ class Robot:
         """Discards the position: the robot was carried elsewhere."""
         self._localiser.lose()
 
-    def withdraw(self, found: Localisation) -> None:
+    def withdraw(self, result: Localisation) -> None:
         """Withdraws a result that a later frame disproved: no pose rests on it any more.
 
         The loop calls it for `Localisation.withdraws`, and so may a caller with better evidence.
         """
-        time_ns = self._clock.time_of(found.stamp_ns)
+        time_ns = self._clock.time_of(result.stamp_ns)
         known = (one for one in self.track if one.stamp_ns == time_ns)
-        self._withdraw(next(known, replace(found, stamp_ns=time_ns)))
+        self._withdraw(next(known, replace(result, stamp_ns=time_ns)))
 
-    def _withdraw(self, found: Localisation) -> None:
+    def _withdraw(self, result: Localisation) -> None:
         """The same for a result as it is in `track`."""
         track, rests = [], False
         for one in self.track:
-            rests = one.stamp_ns == found.stamp_ns or (rests and not one.localised)
+            rests = one.stamp_ns == result.stamp_ns or (rests and not one.localised)
             track.append(replace(one, position=None) if rests else one)
             rests = rests and one.saved is None  # from there on it is seen from that node
         self.track = tuple(track)
-        self._keeper.withdrawn(found)
+        self._result_sink.withdrawn(result)
         if self.recorder is not None:
             self.recorder.withdrew()
 
@@ -360,7 +360,7 @@ class Robot:
             if unknown or outside these frames.
         """
         stamp_ns = self._clock.time_of(stamp_ns)
-        usable = [one for one in self.track if one.motion.usable]
+        usable = [result for result in self.track if result.motion.usable]
         after = bisect_left(usable, stamp_ns, key=lambda one: one.stamp_ns)
         if after == len(usable):
             return None
@@ -397,28 +397,28 @@ class Robot:
         if waits and examination.full:
             self.unfit = self.diagnosis.fatal
             if self._live is not None:
-                self._keeper = self._live.examined(self.unfit, self._keeper)
+                self._result_sink = self._live.examined(self.unfit, self._result_sink)
         return taken
 
     def _known(self, frame: Frame, motion: Motion) -> Localisation | None:
-        """Applies the keeper's hint; returns its result if the frame needs no localising."""
-        hint = self._keeper.hint(frame, motion)
+        """Applies the result sink's hint; returns its result if the frame needs no localising."""
+        hint = self._result_sink.hint(frame, motion)
         if hint is None:
             return None
         if hint.position is not None:
             self._localiser.place_at(hint.position, hint.open_loop_m, hint.guessed_m, hint.agreed)
         return hint.found
 
-    def _kept(self, frame: Frame, found: Localisation) -> Localisation:
-        """The result as its keeper completes it; a write error ends a live drive's saving alone."""
+    def _kept(self, frame: Frame, result: Localisation) -> Localisation:
+        """The result, completed by the sink; a write error ends a live drive's saving alone."""
         try:
-            found = self._keeper.keep(frame, found)
+            result = self._result_sink.keep(frame, result)
         except MapError as error:
             if self._live is None:
                 raise
-            self._keeper = self._live.failed(error)
-        self._saving.nodes += found.saved is not None
-        return found
+            self._result_sink = self._live.failed(error)
+        self._saving.nodes += result.saved is not None
+        return result
 
     def _placed(self, arrived: Arrived, *, trusted: bool) -> Placed | None:
         """The frame's stamp with its time; None without. The first one begins a live drive."""
@@ -428,7 +428,7 @@ class Robot:
         if not placed:
             return None
         if self._time_ns is None and self._live is not None:
-            self._keeper = self._live.begin(at_time(arrived, placed[-1].time_ns))
+            self._result_sink = self._live.begin(at_time(arrived, placed[-1].time_ns))
         self._time_ns = placed[-1].time_ns
         return placed[-1]
 
@@ -442,11 +442,11 @@ class Robot:
         return _unlocalised(stamp_of(arrived), guess, position)
 
 
-def _word(found: Localisation) -> str:
+def _word(result: Localisation) -> str:
     """The status of a frame, in one word."""
-    if found.resumed:
+    if result.resumed:
         return "resuming"
-    return "saved" if found.saved else found.status.value
+    return "saved" if result.saved else result.status.value
 
 
 def _unlocalised(stamp_ns: int, motion: Motion, position: Position | None) -> Localisation:
@@ -493,7 +493,7 @@ def _is_elsewhere(placed: Placed, motion: Motion) -> bool:
     return back and motion.guessed_m > 0 and motion.odometry.status is not OdometryStatus.OK
 
 
-class Whereabouts:
+class DisplayPose:
     """Follows a robot in the map frame, for display and messages.
 
     Nodes get their place in the frame with the revision that commits them. Until then one that the
@@ -517,21 +517,21 @@ class Whereabouts:
         """``map_from_node``; None for a node without a place."""
         return self._saved.get(node) or self._frame.find(node)
 
-    def after(self, found: Localisation) -> SE3 | None:
+    def after(self, result: Localisation) -> SE3 | None:
         """``map_from_live`` at the next frame of the drive; None where it is not known.
 
         Args:
             found: the result of each frame, one after another.
         """
-        position = found.position
+        position = result.position
         map_from_node = None if position is None else self._found(position.node)
         here = None
         if position is not None and map_from_node is not None:
             here = map_from_node @ position.node_from_live
-        elif found.saved is not None and not self._saved and not len(self._frame.positions):
+        elif result.saved is not None and not self._saved and not len(self._frame.positions):
             here = SE3(MAP_FROM_CAMERA.copy(), np.zeros(3))
-        if found.saved is not None and here is not None:
-            self._saved[found.saved] = here
+        if result.saved is not None and here is not None:
+            self._saved[result.saved] = here
         return here
 
     def _found(self, node: NodeId) -> SE3 | None:

@@ -226,7 +226,7 @@ def _commit(opened: Map, chunks: Iterator[dict[str, Any]], path: Path) -> Revisi
         if entry.sequence >= writer.stored.next_sequence:
             writer.add_path_entry(entry)
     first = writer.stored.next_iteration
-    writer.add_attempts([one for one in attempts if one.iteration >= first])
+    writer.add_attempts([attempt for attempt in attempts if attempt.iteration >= first])
     return writer.commit()
 
 

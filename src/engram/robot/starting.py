@@ -18,7 +18,7 @@ from engram.measures import Drive, failure, longest_gap_m, route_m, route_not_lo
 from engram.monitor import QUIET, Monitor
 from engram.odometry.motion import driven_steps_m
 from engram.ranking.context import RankingPolicy
-from engram.robot.anchors import ToldFix, relocaliser_with_fixes, suggesting
+from engram.robot.anchors import ReceiverFix, relocaliser_with_fixes, suggesting
 from engram.robot.drive_session import (
     LiveDrive,
     RobotSetup,
@@ -80,7 +80,7 @@ def robot_in(
     maps: bool = False,
     remembers: bool = False,
     front: Front | None = None,
-    fix: ToldFix | None = None,
+    fix: ReceiverFix | None = None,
 ) -> Robot:
     """A live robot; see `Map.robot`.
 
@@ -188,14 +188,14 @@ def measure(
     return measured(localise_drive(opened, sequence, settings, options, monitor))
 
 
-def measured(found: Sequence[Localisation]) -> Drive:
+def measured(results: Sequence[Localisation]) -> Drive:
     """The input of the measures, from a drive's localisations.
 
     Steps that odometry could not measure are guessed, and the motion past unusable frames is
     shared among them: otherwise the worst stretches of a drive would not count.
     """
-    steps_m = driven_steps_m([one.motion for one in found], [one.stamp_ns for one in found])
-    localised = [one.localised for one in found]
+    steps_m = driven_steps_m([one.motion for one in results], [one.stamp_ns for one in results])
+    localised = [one.localised for one in results]
     return Drive(steps_m, np.array(localised, np.bool_))
 
 

@@ -229,6 +229,7 @@ def _frames(source: Path, kind: DescriptorKind | None) -> list[Frame]:
     frontend = Frontend(settings.frontend)
     with closing(arriving(sequence)) as entries:
         frames = [
-            one.frame if isinstance(one, LoggedFrame) else frontend.extract(one) for one in entries
+            entry.frame if isinstance(entry, LoggedFrame) else frontend.extract(entry)
+            for entry in entries
         ]
     return [frame for frame in frames if frame.status is FrameStatus.OK]

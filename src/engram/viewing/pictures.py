@@ -27,7 +27,7 @@ from engram.localiser.localisation import Localisation
 from engram.maps.difference import MapDifference
 from engram.maps.frame_reader import FrameReader
 from engram.maps.map import Map
-from engram.robot.robot import Seen
+from engram.robot.robot import LastFrame
 from engram.untrusted import printable
 
 
@@ -173,7 +173,7 @@ class PictureWriter:
         except OSError as error:
             raise InputError(f"{folder}: cannot be created: {error.strerror}") from error
 
-    def offer(self, seen: Seen, localisation: Localisation) -> None:
+    def offer(self, seen: LastFrame, localisation: Localisation) -> None:
         """Writes a picture of the frame just localised, if it is due.
 
         Args:

@@ -16,7 +16,7 @@ from engram.graph.model import SessionId
 from engram.localiser.attempts import outcome_at
 from engram.localiser.localisation import Localisation, LocalisationStatus
 from engram.maps.map import Map
-from engram.robot.robot import Robot, Seen, Whereabouts
+from engram.robot.robot import DisplayPose, LastFrame, Robot
 from engram.untrusted import printable
 
 _STATUS_COLOURS = {
@@ -53,7 +53,7 @@ class Viewer:
                 self._stream.save(str(save))
             except (OSError, RuntimeError) as error:
                 raise InputError(f"{save}: cannot be written: {error}") from error
-        self._whereabouts: Whereabouts | None = None
+        self._display_pose: DisplayPose | None = None
         self._driven: list[NDArray[np.float64]] = []
 
     def __enter__(self) -> Self:
@@ -78,7 +78,7 @@ class Viewer:
         Args:
             graph: with what a robot saves; None for that of the map.
         """
-        self._whereabouts = Whereabouts(opened.frame, opened.graph if graph is None else graph)
+        self._display_pose = DisplayPose(opened.frame, opened.graph if graph is None else graph)
         self._driven = []
         numbers: dict[SessionId, int] = {}
         for node in opened.graph.nodes:
@@ -94,7 +94,7 @@ class Viewer:
         )
         self._stream.log("map/goals", stars, static=True)
 
-    def see(self, seen: Seen, localisation: Localisation) -> None:
+    def see(self, seen: LastFrame, localisation: Localisation) -> None:
         """Shows a frame, its inliers, the candidates, and how sure the robot is.
 
         Args:
@@ -116,14 +116,14 @@ class Viewer:
         self._show_candidates(seen)
         self._show_place(localisation, colour)
 
-    def _show_candidates(self, seen: Seen) -> None:
+    def _show_candidates(self, seen: LastFrame) -> None:
         right, wrong = (
             _STATUS_COLOURS[status]
             for status in (LocalisationStatus.LOCALISED, LocalisationStatus.LOST)
         )
         places, colours = [], []
         for outcome in seen.outcomes:
-            map_from_node = self._whereabouts and self._whereabouts.of(outcome.candidate.node)
+            map_from_node = self._display_pose and self._display_pose.of(outcome.candidate.node)
             if map_from_node:
                 places.append(map_from_node.translation)
                 colours.append(right if outcome.accepted else wrong)
@@ -131,7 +131,7 @@ class Viewer:
         self._stream.log("map/tried", points)
 
     def _show_place(self, localisation: Localisation, colour: tuple[int, int, int]) -> None:
-        map_from_live = self._whereabouts and self._whereabouts.after(localisation)
+        map_from_live = self._display_pose and self._display_pose.after(localisation)
         if not map_from_live:
             return
         position_m = map_from_live.translation

@@ -32,7 +32,7 @@ from engram.graph.model import NodeId
 from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.localiser.acceptance import Prediction, Spread
 from engram.localiser.attempts import Candidate, Lanes, Matcher, one_by_one
-from engram.localiser.localisation import Hint, Keeper, Localisation, Position
+from engram.localiser.localisation import Hint, Localisation, Position, ResultSink
 from engram.localiser.localiser import Localiser
 from engram.maps.map import Map
 from engram.odometry.motion import GapFiller, Motion, driven_steps_m
@@ -251,7 +251,7 @@ def _note(
         runs.near_seen[row, number] = len(near & seen)
 
 
-class _Placing(Keeper):
+class _Placing(ResultSink):
     """Supplies where the drive starts, and keeps nothing."""
 
     def __init__(self, situation: Situation) -> None:
@@ -260,7 +260,7 @@ class _Placing(Keeper):
             self._stamp_ns = situation.frames[self._start[0]].frame.stamp_ns
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
-        """See `Keeper`."""
+        """See `ResultSink`."""
         del motion
         if self._start is None or live.stamp_ns != self._stamp_ns:
             return None
@@ -304,13 +304,13 @@ def _robots(
 ) -> Iterator[list[_Running]]:
     """One per configuration; in one map they share its matches."""
     with ExitStack() as stack:
-        keeper, running = _Placing(situation), list[_Running]()
+        result_sink, running = _Placing(situation), list[_Running]()
         for one in configurations:
             own: LocaliserParts = {**parts, "policy": one.policy, "budget": one.budget}
             asked = _settings_for(settings, one, guided=parts["matcher"] is None)
             localiser = localiser_in(situation.opened, situation.drive.camera, asked, **own)
             # Each has a front of its own, which tells time by the frames that it takes.
-            robot = stack.enter_context(Robot(Front(settings), localiser, keeper))
+            robot = stack.enter_context(Robot(Front(settings), localiser, result_sink))
             running.append(_Running(robot, localiser))
         yield running
 

@@ -39,10 +39,10 @@ from engram.localiser.attempts import Outcome
 from engram.localiser.localisation import (
     Budget,
     Hint,
-    Keeper,
     Localisation,
     LocalisationStatus,
     Position,
+    ResultSink,
 )
 from engram.localiser.localiser import Localiser
 from engram.localiser.relocalisation import Relocaliser
@@ -255,11 +255,11 @@ _ITERATION_GAP = 100
 _AGREED = 5
 
 
-class Replay(Keeper):
+class Replay(ResultSink):
     """Replays segments one after another and adds what is missing from the fleet map.
 
-    Each segment is a drive of `Robot.step`, with this object as the keeper. What fixes on trial
-    would omit or tie is held back until they have proved themselves.
+    Each segment is a drive of `Robot.step`, with this object as the result sink. What fixes on
+    trial would omit or tie is held back until they have proved themselves.
 
     Args:
         monitor: receives the outcome of each node; its `check` is called after each.
@@ -317,7 +317,7 @@ class Replay(Keeper):
         return SegmentReport.of(session, seed, self._kept)
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
-        """See `Keeper`: the position of a frame that the robot itself measured to a known node."""
+        """See `ResultSink`: the position of a frame by what the robot measured to a known node."""
         del motion
         node, (known, self._start) = self._stored.node, (self._start, None)
         if self._options.seed is SeedFrom.PLACES:
@@ -335,7 +335,7 @@ class Replay(Keeper):
         return Hint(known, open_loop_m, agreed=_AGREED)
 
     def may_propose_own(self) -> bool:
-        """See `Keeper`.
+        """See `ResultSink`.
 
         While odometry holds, a drive's match with its own nodes far back is a loop, which the robot
         closed itself and whose edges come along, or a look-alike, which would take nodes away.
@@ -343,7 +343,7 @@ class Replay(Keeper):
         return not self._localiser.certain
 
     def keep(self, live: Frame, found: Localisation) -> Localisation:
-        """See `Keeper`: omits or takes the node, once its fix is no longer on trial."""
+        """See `ResultSink`: omits or takes the node, once its fix is no longer on trial."""
         outcomes, attempts = self._localiser.outcomes, self._localiser.attempts()
         if self._ahead is not None and self._ahead.found is found:
             outcomes, attempts = self._ahead.outcomes, []
@@ -358,7 +358,7 @@ class Replay(Keeper):
         return found
 
     def withdrawn(self, found: Localisation) -> None:
-        """See `Keeper`: the frame was not localised, nor do those after it have a position."""
+        """See `ResultSink`: the frame was not localised, nor do those after it have a position."""
         for held in self._held:
             if held.found.stamp_ns >= found.stamp_ns:
                 held.withdrawn(is_the_fix=held.found.stamp_ns == found.stamp_ns)

@@ -32,7 +32,7 @@ from engram.localiser.localisation import Localisation
 from engram.maps.map import open_map
 from engram.monitor import QUIET, Monitor
 from engram.robot.mapping import Beginning, map_drive
-from engram.robot.robot import Seen
+from engram.robot.robot import LastFrame
 from engram.robot.settings import RobotOptions, Settings
 from engram.sequences.motion_files import Trajectory
 from engram.sequences.opening import open_drive
@@ -93,7 +93,7 @@ def _told(scene: Scene, beginning: Beginning) -> None:
         return
     hint, before_ns = scene.hint, scene.clip.pairs[scene.start - 1].stamp_ns
 
-    def tell(seen: Seen, found: Localisation) -> None:
+    def tell(seen: LastFrame, found: Localisation) -> None:
         del found
         if seen.frame.stamp_ns == before_ns:
             beginning.robot.place_at(hint)
