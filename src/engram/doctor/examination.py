@@ -47,7 +47,6 @@ class Rematched:
     """Inliers of the frames that were matched again.
 
     Attributes:
-        frames: how many.
         focal, baseline: (13,) int64: sums of their inliers if that is too large by `FACTORS`.
     """
 
@@ -134,7 +133,6 @@ class Alignment:
         slope_px: (2,) change of that over the width and the height of the image: roll and scale.
         forward_m: distance forwards from where the left image was taken to where the right one was.
         sigma_m: standard deviation of that.
-        agreeing: the matches that agree.
     """
 
     offset_px: float
@@ -301,7 +299,6 @@ class Facts:
     """Facts about a drive in addition to its frames.
 
     Attributes:
-        clock: meaning of the stamps.
         zone: time zone, if known.
         longitude_deg: where the drive was, if known.
         by_hour: whether missions by hour need its clock.
@@ -322,7 +319,6 @@ class Look:
     """What one pair looks like; left and right, each from every 64th pixel.
 
     Attributes:
-        brightness: mean grey levels.
         saturated, black: largest share of white and of black pixels.
         repeats: whether the image is that of the pair before, but for a text in it.
         contrast: standard deviations, grey levels.
@@ -342,18 +338,14 @@ class Evidence:
     """Evidence about a drive; one entry per frame unless noted.
 
     Attributes:
-        config: the limits.
         camera: of the drive; None before the first frame.
         facts: facts in addition to the frames.
-        stamps_ns: stamps in the order of arrival.
         first: whether a stretch begins with the frame, so that nothing is known of the time before.
         statuses: of the frames.
         odometry: whether odometry measured the motion, or had none to measure.
         moved: `prev_from_curr`, None where it was not measured.
         sigma_m: standard deviation of that, m; 0 where it was not measured.
         looks: of the images; empty for a frame log.
-        disparity_px: median of the landmarks.
-        sharpness: of every few pairs.
         matches: left-right matches of every few pairs, and the number of their frame.
         read: what happened to the stamps in the reader of the drive.
         taken: what happened to them in a robot, which has its frames one by one.
@@ -440,8 +432,6 @@ class Examination:
 
         Args:
             arrived: its images, or the logged frame.
-            frame: what the front-end made of it.
-            motion: the motion that led to it.
             outside: the same as measured by wheels or another source; None if it was not.
             turned_rad: how far it turned by gyroscope or wheels; None if that was not measured.
         """

@@ -34,12 +34,7 @@ class Finding:
 
     Attributes:
         code: name of the check, see `CHECKS`.
-        severity: how bad it is.
         message: what is wrong, in words.
-        value: what was measured.
-        limit: what it may be.
-        unit: of both.
-        cure: what to do.
     """
 
     code: str
@@ -69,7 +64,6 @@ class Diagnosis:
 
     Attributes:
         frames: how many frames were examined.
-        findings: what is wrong.
         untold: checks that could not be made, and what they would need, by code.
         seen: (height, width) bool of the rectified left image, False where it moves with the
             camera; None if nothing does.
@@ -113,12 +107,9 @@ class Check:
 
     Attributes:
         code: name of its finding; two checks may share one, the first that alarms counts.
-        severity: of its finding.
         measure: the value; None if undetermined.
         limit: field of `DoctorConfig` that bounds the value, or the bound itself.
-        unit: of the value.
         message: what is wrong beyond the limit, in words.
-        cure: what to do then.
         advice: the same in the light of what was seen; None where that adds nothing.
         example: one of the things that are wrong, for the message.
         below: whether values below the limit are the alarm, not those above.

@@ -139,7 +139,6 @@ class Driving:
     is kept over these, so vague that it only proposes where to look. One thread uses it.
 
     Args:
-        options: map and robot.
         now: the clock, seconds.
         watcher: shows each robot that drives; None to show none.
     """
@@ -370,7 +369,6 @@ def _stamp_trouble(clock: SteadyClock, stamp_ns: int, steps: int) -> str:
 
     Args:
         clock: the clock, which has taken it.
-        stamp_ns: the stamp.
         steps: how often the clock had been set before.
     """
     if len(clock.steps) > steps:

@@ -122,7 +122,6 @@ class Ring:
         """Writes a pair; returns the ticket by which it is read.
 
         Args:
-            stamp_ns: capture time.
             left, right: (height, width) uint8.
 
         Raises:

@@ -150,7 +150,6 @@ class LiveProcess:
 
     Args:
         transport: brings frames and commands.
-        options: map and robot.
         now: the clock, seconds.
         watcher: shows each robot that drives; None to show none.
     """

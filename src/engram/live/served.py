@@ -55,8 +55,6 @@ class Command:
 
     Attributes:
         do: such as `map` or `stop`; see `engram.live.link`.
-        given: its arguments.
-        id: repeated in the answer.
     """
 
     do: str
@@ -83,8 +81,6 @@ class Played:
     """A transport that plays a recorded drive, in real time or as fast as the robot goes.
 
     Args:
-        sequence: the drive.
-        hear: called with each message.
         rate_hz: frames a second, of which late ones are dropped; None plays every frame at once.
             The first one waits for the robot, which opens its map with it.
     """
@@ -131,9 +127,6 @@ class Served:
         path: where the socket's file is made, for its owner alone.
         once: end with the first client, or if none comes within a minute: nothing else
             would stop the process.
-
-    Raises:
-        InputError: something else lies there, or another process listens.
     """
 
     def __init__(self, path: Path, *, once: bool = False) -> None:

@@ -204,8 +204,6 @@ def accept(match: Match, prediction: Prediction, config: AcceptanceConfig) -> bo
 
     Args:
         match: the match of the live frame with one node.
-        prediction: what was expected.
-        config: the thresholds.
     """
     if match.reference_from_live is None or match.inliers < config.min_inliers:
         return False
@@ -242,7 +240,6 @@ def accept_lost(match: Match, spread: Callable[[], Spread], config: AcceptanceCo
     Args:
         match: the match of the live frame with one node.
         spread: computes `inlier_spread` of the match; called only if it decides.
-        config: the thresholds.
     """
     return match.inliers >= config.min_inliers_lost and plausible(match, spread, config)
 
@@ -270,7 +267,6 @@ class Lenses:
 
     Args:
         graph: the experience graph; it may grow.
-        sessions, cameras: of the map.
         focal_px: of the live camera, which saves whatever is not in the map yet.
         depth_m: usual depth of what matches; 0 turns the correction off.
     """

@@ -42,8 +42,6 @@ class Candidate:
     """A node to be attempted.
 
     Attributes:
-        index: its dense index in the experience graph.
-        node: its UUID.
         prediction: where the live camera is expected; None when relocalising.
         guided: whether matching uses the prediction (method §3.2).
         row: its row in the neighbourhood; None when relocalising.
@@ -73,13 +71,11 @@ class Outcome:
     """The outcome of one attempt.
 
     Attributes:
-        candidate: the attempted node.
         rank: its place in the order, from 0.
         match: its match with the live frame.
         accepted: whether the match is a localisation.
         plausible: whether it would be one if another frame agreed.
         damaged: whether the node's landmarks are unreadable, which leaves nothing to match.
-        confidence: log-odds that the match is right.
         evidence: what these were computed from; None without a pose.
     """
 
@@ -146,8 +142,6 @@ class Lanes:
     Matches are seeded by the UUIDs of both frames.
 
     Args:
-        frames: the landmarks.
-        config: settings.
         lost_config: settings where nothing is predicted; None for the same.
         count: number of lanes; the first is the thread of the caller.
     """
@@ -206,8 +200,6 @@ class Attempter:
     """Makes attempts: matches the live frame with nodes, and judges the matches.
 
     Args:
-        frames: where the landmarks of nodes come from.
-        config: settings of both halves.
         matcher: the first half, for studies that keep matches; None for the landmarks of `frames`.
         lanes: how many matches with `frames` are made at once.
     """
@@ -257,7 +249,6 @@ class Attempter:
             live: the live frame.
             live_id: its UUID; with the node's UUID it seeds the matcher.
             rank: place of the first candidate in the order.
-            candidates: what to attempt.
         """
         matches = self._matcher.matches(live, live_id, candidates)
         best = [
@@ -376,12 +367,7 @@ def add_outcomes(
     """Adds the outcomes of one frame to the history of its drive.
 
     Args:
-        history: grows.
         live: the frame.
-        near: the neighbourhood of its predicted candidates.
-        outcomes: of all its attempts.
-        basin: of the live camera.
-        lenses: of the map's drives.
     """
     history.add(
         [outcome.candidate.index for outcome in outcomes],
@@ -399,15 +385,7 @@ def stored_attempts(
     outcomes: Sequence[Outcome],
     policy: str,
 ) -> list[Attempt]:
-    """The attempts of one iteration that had a prediction, as a map stores them (method §3.5).
-
-    Args:
-        iteration: its number.
-        near: the neighbourhood of the candidates.
-        reference: node that the position referred to.
-        outcomes: of all attempts.
-        policy: name of the policy that ordered them.
-    """
+    """The attempts of one iteration that had a prediction, as a map stores them (method §3.5)."""
     return [
         Attempt(
             iteration=iteration,

@@ -127,11 +127,8 @@ class Evidence:
     """Evidence about a match when it is judged.
 
     Attributes:
-        inliers: landmarks that agree on the pose.
         share: of the landmarks of the poorer frame.
-        distance_m: between live camera and node.
         match_sigma_m: root of the summed variances of the position.
-        standing: of the robot.
         sigma_m: standard deviation of the predicted position; infinite without a prediction.
         apart: distance between measured and predicted position over `sigma_m` and a slack;
             infinite if they contradict each other, or without a prediction.
@@ -235,7 +232,6 @@ class ConfidenceModel:
         witness: what a second match adds that agrees some distance later.
         weak_inliers: matches of fewer must spread even near a confirmed position: a robot that is
             carried elsewhere unseen meets look-alikes there, low in the image.
-        calibration: of the sums.
     """
 
     predicted: tuple[float, ...]

@@ -74,8 +74,6 @@ class Verdict(NamedTuple):
     Attributes:
         accepted: whether it is a localisation.
         waits: whether it would be one if another frame agreed.
-        confidence: log-odds that it is right.
-        evidence: what these were computed from.
     """
 
     accepted: bool
@@ -85,11 +83,7 @@ class Verdict(NamedTuple):
 
 
 class MatchRule:
-    """Weighs one match by itself.
-
-    Args:
-        acceptance: thresholds.
-    """
+    """Weighs one match by itself."""
 
     def __init__(self, acceptance: AcceptanceConfig) -> None:
         self.acceptance = acceptance
@@ -176,8 +170,6 @@ class _Hypothesis:
     """A match that waits.
 
     Attributes:
-        position: where it says the robot is now.
-        driven_m: distance since the match.
         agreed_m: distance before it over which others agreed with it.
     """
 
@@ -196,11 +188,7 @@ class Hypotheses:
     """Weak matches that wait for a second one; a `Follower`.
 
     Args:
-        graph: the experience graph.
-        search: finds the nodes near a position.
-        acceptance: thresholds by which two positions agree.
         vague_m: standard deviation of a position beyond which agreement with it says nothing.
-        config: how long they wait.
     """
 
     def __init__(
@@ -377,8 +365,6 @@ class FixChain:
 
         Args:
             stamp_ns: stamp of its frame.
-            found: where it is.
-            alone: its confidence without the fixes before it.
             joins_after_m: distance between agreeing fixes, metres, that joins two parts of a map.
                 Where it is longer than what settles any chain, no single fix settles this one.
         """
@@ -423,9 +409,6 @@ class Fixes:
     Args:
         graph: the experience graph; it may grow.
         track: the position of the robot; follows the fixes.
-        search: finds the nodes near a position.
-        attempter: made the matches.
-        config: settings of the localiser.
 
     Attributes:
         standing: of the position, when the frame began.
@@ -518,9 +501,7 @@ class Fixes:
 
         Args:
             live: the live frame.
-            live_id: its UUID.
             driven_m: odometry distance from the session's start, metres.
-            outcomes: of readable nodes.
         """
         if self._accepted.rule is Rule.INLIERS:
             return self._hypotheses.judge(outcomes, 0.0)
@@ -562,7 +543,6 @@ class Fixes:
 
         Args:
             live: the live frame.
-            success: the accepted match.
             result_sink: has the distance driven since the nodes being saved lost their connection
                 to the map: a fix that nothing predicts reconnects them.
         """

@@ -69,9 +69,6 @@ class MapParts:
     """What a localiser reads of a map; graph and paths may grow.
 
     Attributes:
-        graph: the experience graph.
-        paths: the path memory.
-        frames: where the landmarks of nodes come from.
         background: what policies may use of the map beyond its graph and paths.
         search: stands for the graph's own `neighbourhood`, such as one with a cache that the
             localisers of one drive on a fixed graph share; None for that itself. It is not asked
@@ -90,7 +87,6 @@ class InForce:
     """By what a localiser localises.
 
     Attributes:
-        policy: name of the ranking policy.
         budget: attempts per frame.
         config: its settings; neighbourhood, path entries and memory as its parts have them.
     """
@@ -105,7 +101,6 @@ class LiveDrive:
     """The drive whose frames are localised.
 
     Attributes:
-        basin: the match basin of its camera.
         live: its session; the UUID seeds the matcher, so that the same drive gives the same
             results.
         saves: whether it is being mapped: then its own recent nodes are not candidates.
@@ -130,13 +125,9 @@ class Localiser:
     between calls.
 
     Args:
-        known: the map.
-        drive: the session.
-        policy: orders the candidates.
         budget: how many attempts a frame may make.
         relocaliser: proposes nodes to a lost robot; with None it tries the nodes near its dead
             reckoning, within a growing radius.
-        config: settings.
         matcher: the first half of an attempt; None matches with the landmarks of `known`.
         threads: how many threads the lanes share, the caller's included; None for one each. A
             given `matcher` runs on the caller's.
@@ -284,7 +275,6 @@ class Localiser:
         """Sets the position, as an operator or another localiser would.
 
         Args:
-            position: where the robot is.
             open_loop_m: distance driven since the last match with the map, metres; None keeps
                 the count.
             guessed_m: standard deviation of the motion guessed since then, metres.
@@ -301,7 +291,6 @@ class Localiser:
         """Position of a robot standing where the node was recorded; see `Position.mounted`.
 
         Args:
-            node: the reference node.
             live: the live frame.
             covariance: (6, 6) float64 of the pose, left perturbation, [translation in m, rotation
                 in rad].
@@ -333,7 +322,6 @@ class Localiser:
 
         Args:
             driven_m: odometry distance from the session's start to that frame, metres.
-            next_iteration: number of the first iteration.
         """
         self._driven_m = driven_m
         self._history.resume(next_iteration)
@@ -362,10 +350,6 @@ class Localiser:
             live: the live frame; `move` has been called with the motion that led to it.
             deadline: `time.perf_counter` value after which no attempt starts; None for no limit.
             result_sink: decides whether places beyond the neighbourhood may be tried.
-            clock: measures the duration of each stage.
-
-        Raises:
-            IncompatibleError: the map was made with another kind of descriptor.
         """
         clock = clock or StageClock()
         self._new_damaged, self._near, self._looked_up, self._beyond = (), None, False, []

@@ -65,7 +65,6 @@ class PlaceBelief:
 
     Args:
         graph: the experience graph; may grow between calls.
-        config: settings.
     """
 
     def __init__(self, graph: ExperienceGraph, config: BeliefConfig | None = None) -> None:
@@ -241,9 +240,7 @@ class ByAppearance:
 
     Args:
         graph: the experience graph; may grow.
-        words: the visual words of its nodes.
         name: key in `RELOCALISERS`.
-        recogniser: makes the recogniser for a vocabulary.
     """
 
     def __init__(
@@ -355,9 +352,7 @@ def best_places(book: PlaceBook, likely: NDArray[np.float64], most: int) -> list
     """The most likely nodes, best first, without those whose words are unreadable.
 
     Args:
-        book: the words of the nodes.
         likely: (N,) float64, score of each node on any scale.
-        most: how many to consider.
 
     Returns:
         Dense indices into the graph.

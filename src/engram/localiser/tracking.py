@@ -41,7 +41,6 @@ class Track:
     """The position of a robot; a `Follower`.
 
     Args:
-        graph: joins the nodes that are matched.
         earlier_doubt: see `LocaliserConfig`.
         greatest_gap_m: largest standard deviation of guessed motion at which it is certain, metres.
 
@@ -92,7 +91,6 @@ class Track:
         """The newest match.
 
         Args:
-            matched: the position by it.
             leans: whether it is weak, and earlier ones led to expect it.
         """
         before, self.measured, self.best = self.best, matched, matched
@@ -120,7 +118,6 @@ def fused(expected: Position, matched: Position, doubt: float) -> Position:
     stands claims no more than `doubt / (doubt - 1)` matches' worth (a fading memory).
 
     Args:
-        expected: what earlier matches and odometry predict.
         matched: the newest match, seen from the same node.
         doubt: by how much the covariance of `expected` is taken to be larger.
     """

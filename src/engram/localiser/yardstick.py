@@ -105,7 +105,6 @@ class Usual:
     """What a node has in common with its neighbour in the same drive.
 
     Attributes:
-        inliers: of their match.
         bits: median number of bits in which descriptors of the inliers differ.
     """
 
@@ -119,7 +118,6 @@ class Yardstick:
     Args:
         graph: the experience graph; it may grow.
         frame: the frame of a node; None if it is damaged.
-        config: the matcher's.
     """
 
     def __init__(
@@ -184,7 +182,6 @@ def contradicted(match: Match, reference: Frame, live: Frame) -> float:
     in the same direction, but at another depth, something has come or gone.
 
     Args:
-        match: a match with a pose.
         reference: the node's frame.
         live: the live frame.
     """
@@ -278,9 +275,6 @@ class Likeness:
 
 class Run:
     """The log-odds that a run of matches is one of look-alikes.
-
-    Args:
-        config: settings.
 
     Attributes:
         believed: whether its matches are accepted.

@@ -87,7 +87,6 @@ class _Question:
     """A saved node that may close a loop.
 
     Attributes:
-        node: the node.
         frame: its frame.
         known: nodes of the map when it was saved.
         excluded: (K,) int64, dense indices of those that would close no loop, each once.
@@ -104,10 +103,6 @@ class _Match:
     """A match that would close a loop.
 
     Attributes:
-        edge: that it would add.
-        match: the match.
-        frame: of the new node.
-        depth_m: of the inliers.
         alike: log-odds that it is a look-alike, beyond those that prove it none.
     """
 
@@ -123,10 +118,7 @@ class LoopSearch:
 
     Args:
         graph: the experience graph; searched by the calling thread only.
-        book: the words of its nodes.
         attempter: makes attempts, as of a lost robot: there is no prediction.
-        acceptance: thresholds by which two matches agree.
-        config: settings.
         yardstick: what matches in this map usually have; None: look-alikes are not detected.
     """
 
@@ -296,7 +288,6 @@ def edges_agree(
     Args:
         graph: contains the paths from `a` to `a`, and from `b` to `b`.
         first, second: edges between the same two parts of it.
-        acceptance: disagreement that is allowed.
         certain_m: largest standard deviation of both ways; a long chain contradicts nothing.
     """
     driven = graph.predict(graph.index(first.b), graph.index(second.b))

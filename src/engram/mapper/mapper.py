@@ -102,8 +102,6 @@ class Saver:
     dropped: a shorter session is better than one with holes.
 
     Args:
-        sink: where the records go.
-        path: the drive's path.
         checkpoint_every: live frames between two checkpoints; a crash loses at most these.
         waits: whether a full queue blocks the caller; else it raises.
         last: the last entry of the path that an interrupted run had stored; None for none.
@@ -135,9 +133,6 @@ class Saver:
         """Takes what one frame adds, and queues all but so many of the newest frames.
 
         The frame of a node is readable from then on, even if it is never written.
-
-        Raises:
-            MapError: an earlier write failed, or too many wait to be written.
         """
         if records.node is not None and records.frame is not None:
             self._sink.hold(records.node.id, records.frame)
@@ -163,11 +158,7 @@ class Saver:
                 self._held[at] = replace(one, attempts=failed, visit=None)
 
     def finish(self) -> None:
-        """Writes what is queued, checkpoints and ends the thread; what is held back is dropped.
-
-        Raises:
-            MapError: a write failed.
-        """
+        """Writes what is queued, checkpoints and ends the thread; what is held back is dropped."""
         if self._thread is not None:
             self._queue.put(None)
             self._thread.join()
@@ -217,8 +208,6 @@ class Memory(ResultSink):
     remembered are only followed; the memory continues after them.
 
     Args:
-        localiser: the drive's localiser.
-        saver: writes path and attempts.
         stored: what an interrupted run had stored of the drive; None for a new one.
 
     Attributes:
@@ -371,7 +360,6 @@ class EdgeVotes:
 
     Args:
         graph: the experience graph of the drive alone: distrusted edges are changed in it.
-        config: settings.
 
     Attributes:
         removals: the distrusted edges, to be stored with the drive.
@@ -389,7 +377,6 @@ class EdgeVotes:
 
         Args:
             stamp_ns: stamp of the frame.
-            outcomes: of its attempts.
         """
         sure = sorted(self._sure(outcomes), key=lambda found: found[0], reverse=True)
         if len(sure) < 2:
@@ -492,9 +479,6 @@ class Mapper(Memory):
     Args:
         graph: the experience graph; grows.
         localiser: the session's localiser, on the same graph.
-        saver: writes the additions.
-        session: the drive.
-        config: settings.
         loops: closes loops during the drive; None leaves them to the localiser's relocaliser.
         stored: what an interrupted run had stored of the session; None for a new one.
 
@@ -560,11 +544,7 @@ class Mapper(Memory):
         return 0.0 if self._joined else self._localiser.driven_m - self._alone_from_m
 
     def keep(self, live: Frame, result: Localisation) -> Localisation:
-        """Saves a frame that did not match, or weakly; ties experiences to their neighbours.
-
-        Raises:
-            MapError: an earlier frame could not be written.
-        """
+        """Saves a frame that did not match, or weakly; ties experiences to their neighbours."""
         if result.resumed:
             return result
         edges = self._closures + self._proved(result)
@@ -628,11 +608,7 @@ class Mapper(Memory):
         return edges + matched
 
     def finish(self) -> None:
-        """See `ResultSink`: waits for the lookups of the last saved nodes.
-
-        Raises:
-            MapError: an earlier frame could not be written.
-        """
+        """See `ResultSink`: waits for the lookups of the last saved nodes."""
         super().finish()
         edges = self._close_loops(self._loops.finish()) if self._loops else []
         self._saver.put(Records(edges=edges))

@@ -150,7 +150,6 @@ class _Parted:
     """Landmarks of a reference frame, by what they did until another frame.
 
     Attributes:
-        motion: reference_from_live by those that kept no pixel.
         defies: (N,) bool, those that kept their pixel though this motion would have moved them.
         agreeing: rows of those that agree on the motion.
         moving: rows of those among them that it moved far.
@@ -241,7 +240,6 @@ class FixedPixels:
 
         Args:
             step: prev_from_curr; None if it failed.
-            inliers: landmarks that agree on it.
 
         Returns:
             Whether odometry all but rests where the others of that look have moved: it may follow
@@ -269,7 +267,6 @@ class FixedPixels:
         """Looks at the next frame of the camera.
 
         Args:
-            frame: with all its landmarks.
             outside: what wheels and gyroscope may be trusted with at this frame; None if nothing.
             told: the motion since the last frame by them, prev_from_curr; None if not measured.
         """
@@ -584,7 +581,6 @@ def _rests(told: SE3 | None, outside: Guess | None, motion: SE3) -> bool | None:
     Args:
         told: the motion since the reference by them; None if not measured.
         outside: what they may be trusted with; None if nothing.
-        motion: by the landmarks that moved.
     """
     if told is None or outside is None:
         return None

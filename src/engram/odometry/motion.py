@@ -111,7 +111,6 @@ class Jumps:
 
         Args:
             inliers: of this step; 0 if it failed.
-            seconds: that it took.
         """
         jumped = (
             self.suspected and inliers >= self._least and self._steps[-1][0] < self._share * inliers
@@ -143,10 +142,8 @@ class Speed:
 
     Attributes:
         stamp_ns: of the frame in which it ends.
-        seconds: that it took.
         m_per_s: x, y, z in the camera that it begins in.
         sigma_m: standard deviation of its length.
-        inliers: landmarks that agree on it.
         doubted: whether its covariance allows for its being wrong.
     """
 
@@ -175,7 +172,6 @@ class Speeds:
         weak_share: a step with less than this share of the usual inliers is weak.
         steps: so many of the newest make the median speed, and so many in a row may overrule.
         steps_to_know: after so many the speed counts as known.
-        greatest_m_s2: greatest acceleration of a robot.
         weak_m_s2: greatest one that a weak step may claim.
     """
 
@@ -468,7 +464,6 @@ class Motion:
     """Motion of the camera since the previous usable frame, with the gaps of odometry filled.
 
     Attributes:
-        odometry: what odometry measured.
         prev_from_curr: pose of this frame in the previous usable one; None at the first frame of a
             drive and at an unusable one.
         covariance: (6, 6) float64 of `prev_from_curr`, left perturbation, [translation in
@@ -549,9 +544,6 @@ class GapFiller:
       are too short. Among them the robot may be as fast as when odometry was last sharp.
     - A robot that starts its drive moving, without a measured step, has no known speed. Its first
       measured step also accounts for the time before, at the same speed.
-
-    Args:
-        config: how far a guess is trusted.
     """
 
     def __init__(self, config: GapConfig = GapConfig()) -> None:

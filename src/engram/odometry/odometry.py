@@ -124,10 +124,6 @@ class Odometry:
             expected: the motion by wheels and gyroscope, which guides the match where the last
                 speed says nothing; None if unknown.
 
-        Raises:
-            IncompatibleError: the camera or the kind of descriptors differs from that of the
-                previous frame.
-
         Source: method §2.4; [G16] §III-A.
         """
         if frame.status is not FrameStatus.OK:

@@ -440,11 +440,7 @@ class FrozenConfig:
 
 
 class Repeats:
-    """Recognises pictures that repeat an earlier one.
-
-    Args:
-        config: the limits.
-    """
+    """Recognises pictures that repeat an earlier one."""
 
     def __init__(self, config: FrozenConfig) -> None:
         self._config = config
@@ -488,11 +484,7 @@ def equal_share(now: NDArray[np.uint8], before: NDArray[np.uint8]) -> float:
 
 
 class StandsStill:
-    """Recognises pictures that stand still while wheels or a gyroscope say that the robot moves.
-
-    Args:
-        config: the limits.
-    """
+    """Recognises pictures that stand still while wheels or a gyroscope say that the robot moves."""
 
     def __init__(self, config: FrozenConfig) -> None:
         self._config = config
@@ -533,7 +525,6 @@ def rests(told: OutsideMotion | None, config: FrozenConfig) -> bool:
 
     Args:
         told: the motion from frame to frame by a trusted source; None without one.
-        config: the limits.
     """
     if told is None or not told.has_way:
         return False

@@ -71,7 +71,6 @@ class Lessons:
     Attributes:
         base: (N,) float64, that probability by all past drives; without nodes saved since the
             map was opened.
-        unknown: that probability of a node without evidence.
     """
 
     base: NDArray[np.float64]
@@ -107,8 +106,6 @@ class Lessons:
         experience, as nodes a metre apart match alike.
 
         Args:
-            graph: the nodes.
-            path_memory: the paths.
             viewers: V drives, by their paths.
             attempts: their attempts; `session` indexes `viewers`.
             rates: (A,) float64, success rate g at the predicted offset of each attempt.
@@ -298,7 +295,6 @@ class Reasons:
 
     Attributes:
         terms: name → (Y,) float64, scores by row of the neighbourhood.
-        meaning: name → description of the term.
         chances: (Y,) float64, probability of success; None if the policy estimates none.
         by_turn: (Y,) bool, whether a candidate's place is by rotation, not by its score; None if
             the policy has no rotation.

@@ -151,12 +151,7 @@ def policy_names() -> list[str]:
 
 
 def policy_named(name: str) -> RankingPolicy:
-    """A new policy of that name.
-
-    Raises:
-        ConfigError: the name is unknown; the message lists the known ones.
-        IncompatibleError: another package adds the policy, and it cannot be used.
-    """
+    """A new policy of that name."""
     if name in POLICIES:
         return _made(name, POLICIES[name])
     if name in _PLUGINS.names():
@@ -165,11 +160,7 @@ def policy_named(name: str) -> RankingPolicy:
 
 
 def _made(name: str, make: Any) -> RankingPolicy:
-    """The policy that a class or function makes.
-
-    Raises:
-        ConfigError: it is not a policy.
-    """
+    """The policy that a class or function makes."""
     if not callable(make):
         raise ConfigError(f"{make!r} cannot be called; name the policy's class")
     policy: RankingPolicy = make()
@@ -191,11 +182,7 @@ _PLUGINS = PluginGroup("engram.policies", "ranking policy", _made)
 
 
 def check_for_robot(name: str) -> None:
-    """Refuses a policy that looks ahead: a robot would attempt every candidate to rank them.
-
-    Raises:
-        ConfigError: the policy is unknown, or only for evaluations.
-    """
+    """Refuses a policy that looks ahead: a robot would attempt every candidate to rank them."""
     if looks_ahead(policy_named(name)):
         raise ConfigError(
             f"the policy {name} looks ahead, which only an evaluation can do; use it in "

@@ -24,7 +24,6 @@ def likenesses(
     """(Y,) float64: cosine, 0…1, of the idf-weighted word sets of a frame and each node.
 
     Args:
-        words: gives the nodes' words.
         live: (n,) int32, the distinct words of the frame.
         nodes: Y nodes; damaged ones count as without words.
     """

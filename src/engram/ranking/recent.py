@@ -156,9 +156,6 @@ class AttemptHistory:
 
     Its views: `observations`, over the last T iterations and the current one so far; and `run`,
     over the last 200 m, 4,096 attempts at most.
-
-    Args:
-        config: how far back the iterations reach.
     """
 
     def __init__(self, config: RecentConfig | None = None) -> None:

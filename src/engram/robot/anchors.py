@@ -73,11 +73,7 @@ class GivenAnchor:
 
 
 def read_anchors(source: Path) -> tuple[list[GivenAnchor], bool]:
-    """The anchors of a file, and whether they are latitudes and longitudes.
-
-    Raises:
-        InputError: it cannot be read, or a line cannot be used; names file and line.
-    """
+    """The anchors of a file, and whether they are latitudes and longitudes."""
     text = read_text(source, InputError)
     is_json = source.suffix.lower() in {".geojson", ".json"}
     rows = _json_rows(text, source) if is_json else _csv_rows(text, source)
@@ -267,11 +263,7 @@ def _position(
 
 
 class LatestFix:
-    """The newest fix of a stream at a time that rises from call to call.
-
-    Args:
-        fixes: by rising time.
-    """
+    """The newest fix of a stream at a time that rises from call to call."""
 
     def __init__(self, fixes: Iterator[Fix]) -> None:
         self._fixes = fixes
@@ -379,10 +371,7 @@ class AnchorReport:
 
     Attributes:
         revision: its number; None for a preview.
-        anchors: number of anchors used.
-        unplaced: lines whose time is of no node.
         residuals_m: distance of each anchored node from its anchor afterwards, by node.
-        outliers: nodes whose anchors do not fit.
         moved: what moved in the map frame.
     """
 
@@ -437,18 +426,12 @@ def anchor_map(
     """Fits the map frame to known positions, in a revision of its own.
 
     Args:
-        path: the map.
         source: CSV or GeoJSON with a node or a time and a position per line; or a bag with the
             fixes of a satellite receiver.
         topic: topic of the fixes; None if the bag has only one.
         grid: ``map.yaml`` of an occupancy grid, whose pixels the positions are.
-        author: of the revision.
         dry_run: only report.
         placing: how the frame is laid out.
-
-    Raises:
-        InputError: the file cannot be read, names no node of the map, or too few of them.
-        MapError: the map cannot be read or written.
     """
     with Map.open(path, writes=not dry_run) as store:
         given, geographic = _given_by_source(store, source, grid, topic)
@@ -602,10 +585,6 @@ def add_goal(
     Returns:
         The goal as `list_goals` describes it; `replaced`, the earlier goal of its name or None; and
         the number of the `revision`.
-
-    Raises:
-        InputError: the name is empty, a number is not finite, or the map has no nodes.
-        MapError: the map cannot be written.
     """
     if not name.strip():
         raise InputError("a goal needs a name")
@@ -622,12 +601,7 @@ def add_goal(
 
 
 def remove_goal(path: Path, name: str, *, author: str) -> dict[str, Any]:
-    """Removes a goal, in a revision of its own that `Map.revert` undoes.
-
-    Raises:
-        InputError: the map has no such goal.
-        MapError: the map cannot be written.
-    """
+    """Removes a goal, in a revision of its own that `Map.revert` undoes."""
     with Map.open(path, writes=True) as store:
         if name not in store.goals:
             known = ", ".join(sorted(store.goals)) or "none"
@@ -654,11 +628,7 @@ def had_goal(store: MapReader, goal: Goal) -> bool:
 
 
 def list_goals(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
-    """The goals of a map by name, and where they lie now.
-
-    Raises:
-        MapError: the map cannot be read, or has no such revision.
-    """
+    """The goals of a map by name, and where they lie now."""
     with Map.open(path, at=at) as store:
         return [_described(goal, store) for _, goal in sorted(store.goals.items())]
 
@@ -711,7 +681,6 @@ class IslandReport:
 
     Attributes:
         revision: its number; None if nothing was joined.
-        compared: matches tried.
         joined: nodes of both sides of each edge that joins two parts.
     """
 
@@ -743,11 +712,7 @@ def join_islands(
     config: IslandsConfig | None = None,
     monitor: Monitor = QUIET,
 ) -> IslandReport:
-    """Joins the parts of an anchored map that show the same places, in a revision of its own.
-
-    Raises:
-        MapError: the map cannot be read or written.
-    """
+    """Joins the parts of an anchored map that show the same places, in a revision of its own."""
     with Map.open(path, writes=True) as store:
         resolved = (settings or Settings()).for_descriptor(store.descriptor)
         islands = _Islands(store.graph, store.frame, store.frames, resolved, config)

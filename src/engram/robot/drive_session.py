@@ -55,13 +55,8 @@ class RobotSetup:
     """A robot and its drive, before it is opened in a map.
 
     Attributes:
-        camera: its camera.
-        settings: the resolved configuration.
-        options: how it localises.
         name: name of the robot; None for one that saves nothing.
         session: the drive, if known before the first frame.
-        relocaliser: replaces that of the options.
-        policy: replaces the ranking of the options.
         known: sessions of the map, where a drive that was interrupted may be played again: what
             comes is another session.
     """
@@ -78,11 +73,7 @@ class RobotSetup:
     def localiser_in(
         self, opened: Map, *, maps: bool = False, remembers: bool = False
     ) -> Localiser:
-        """The localiser of the drive.
-
-        Raises:
-            ConfigError: the policy or the relocaliser is unknown, or the threads are too few.
-        """
+        """The localiser of the drive."""
         options = self.options
         return localiser_in(
             opened,
@@ -119,10 +110,8 @@ class RobotSetup:
         """The header of the drive's session.
 
         Args:
-            session: the drive.
             source: its images or frame log; a frame log states its own front-end.
             message: text for ``log``.
-            **configuration: stored with the resolved one.
         """
         descriptor, frontend = _front_end_of(source, self.settings)
         resolved = {
@@ -159,7 +148,6 @@ class RevisionSink:
     """The revision of a map that a drive is mapped in; a `Sink`.
 
     Attributes:
-        writer: writes it.
         frames: keeps frames readable until they are written.
         words: finds the words stored with saved nodes; None stores none.
         placing: how nodes are laid out in the map frame.
@@ -207,12 +195,7 @@ class RevisionSink:
 
 
 class DriveSession:
-    """One drive that is being saved, on its own thread. Made by `mapped` and `remembered`.
-
-    Attributes:
-        result_sink: takes the drive's results.
-        localiser: the drive's localiser.
-    """
+    """One drive that is being saved, on its own thread. Made by `mapped` and `remembered`."""
 
     def __init__(
         self,
@@ -262,11 +245,7 @@ class DriveSession:
     def remembered(
         map_path: Path, header: SessionHeader, localiser: Localiser, settings: Settings
     ) -> DriveSession:
-        """A drive of which only path and attempts are saved.
-
-        Raises:
-            MapError: the spool cannot be written.
-        """
+        """A drive of which only path and attempts are saved."""
         sink = Spool(map_path, header, settings.mapper.memory_bytes)
         every = settings.mapper.checkpoint_every
         saver = Saver(sink, path_id(header.session.id), every, waits=False)
@@ -278,19 +257,11 @@ class DriveSession:
         return str(self._sink.path) if isinstance(self._sink, Spool) else ""
 
     def finish(self) -> None:
-        """Ends the drive and saves what its last frames still add.
-
-        Raises:
-            MapError: an earlier frame could not be written.
-        """
+        """Ends the drive and saves what its last frames still add."""
         self.result_sink.finish()
 
     def close(self) -> None:
-        """Writes what is queued, and ends the threads. A mapped session can be resumed.
-
-        Raises:
-            MapError: a write failed.
-        """
+        """Writes what is queued, and ends the threads. A mapped session can be resumed."""
         try:
             with self._loops:
                 self._saver.finish()
@@ -302,7 +273,6 @@ class DriveSession:
 
         Raises:
             MapLockedError: another process writes to the map: the spool waits.
-            MapError: it cannot be written.
         """
         return self._sink.commit(self.result_sink.removals)
 
@@ -332,9 +302,7 @@ class Saving:
             waits in a file next to it; `UNCOMMITTED` if the doctor found something fatal: a mapped
             session then waits for ``engram check --seal``.
         reason: why saving failed or was not committed, or where the memory waits.
-        session: the drive.
         revision: number of the revision that holds the drive.
-        nodes: number of saved nodes.
         recovered: revisions that hold what earlier drives of the robot had saved when their process
             was killed.
     """
@@ -379,7 +347,6 @@ def commit_crashed(opened: Map, robot: str, settings: Settings) -> tuple[int, ..
 
     Args:
         opened: the map; sees the new revisions.
-        robot: name of the robot.
         settings: how the map frame is laid out.
 
     Returns:
@@ -387,7 +354,6 @@ def commit_crashed(opened: Map, robot: str, settings: Settings) -> tuple[int, ..
 
     Raises:
         MapLockedError: another process writes to the map.
-        MapError: it cannot be written.
     """
     waiting = [one for one in opened.interrupted() if one.live and one.pid]
     mine = [hypothesis.session.id for hypothesis in waiting if hypothesis.session.robot == robot]
@@ -442,7 +408,6 @@ class LiveDrive:
     after a write error or an unfit drive that is one that keeps nothing.
 
     Args:
-        setup: the robot.
         opened: the map; the robot's own view of it, which grows, if it maps.
         maps: whether nodes are saved, or only path and attempts.
         saving: whether anything is kept, and the outcome of earlier drives; None to begin.
@@ -502,7 +467,6 @@ class LiveDrive:
         """The result sink from now on: a drive that the doctor found unfit is not committed.
 
         Args:
-            fatal: what it found.
             result_sink: the one until now.
         """
         if not fatal or self._setup.options.force or self.saving.state is not SavingState.ON:
@@ -517,12 +481,6 @@ class LiveDrive:
         """Ends the drive and commits it as a revision, unless the doctor found it unfit.
 
         What was written before a write error is committed all the same.
-
-        Args:
-            fatal: what it found.
-
-        Raises:
-            MapError: it cannot be written, though no earlier write failed.
         """
         failed = self.saving.state is SavingState.FAILED
         try:

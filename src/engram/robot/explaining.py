@@ -61,10 +61,8 @@ class ExplainedCandidate:
         chance: probability of success by the policy; None if it estimates none.
         by_turn: whether its place is by rotation, not by its score: a lost robot also tries nodes
             that it does not rank best.
-        terms: parts of the policy's score.
         attempted: whether the budget reached it.
         would_match: whether it matched, or would have.
-        inliers: inliers of that match.
     """
 
     node: NodeId
@@ -111,7 +109,6 @@ class Explanation:
     Attributes:
         frame: number of the frame.
         stamp_ns: its stamp, UTC.
-        ranking: name of the ranking policy.
         status: localisation status of the frame.
         meaning: description of each term, one line each.
         rule: how the terms give the order; empty if the policy's name says it.
@@ -165,15 +162,7 @@ def explain_frame(
     budget allows.
 
     Args:
-        map_path: NAME.engram.
-        sequence: the drive.
-        settings: the resolved configuration.
         options: frame, ranking and budget.
-
-    Raises:
-        ConfigError: the drive has no such frame, or the policy is unknown.
-        MapError: the map cannot be read.
-        SequenceError: the drive's images cannot be used.
     """
     watching = _Watching(policy_named(options.ranking))
     asked = RobotOptions(

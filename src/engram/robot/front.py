@@ -49,7 +49,6 @@ class Front:
     A frame log already contains frame and odometry.
 
     Args:
-        settings: the resolved configuration.
         camera: that of all its frames; None if the first one decides.
 
     Attributes:
@@ -84,13 +83,7 @@ class Front:
     def check(
         self, arrived: Arrived, motion: Motion | OutsideMotion | None, deadline_ms: float | None
     ) -> None:
-        """Refuses what no step of this robot can take, before anything counts it.
-
-        Raises:
-            InputError: an argument is something else.
-            SequenceError: stamp, camera or images are invalid; see `check_pair`.
-            IncompatibleError: the frame is another camera's.
-        """
+        """Refuses what no step of this robot can take, before anything counts it."""
         if isinstance(arrived, StereoPair):
             check_pair(arrived)
         elif not isinstance(arrived, LoggedFrame):
@@ -165,7 +158,6 @@ class Front:
             arrived: a pair of images, or a frame of a log.
             motion: what wheels and gyroscope measured since the previous frame, or a `Motion` that
                 replaces odometry; give the latter for all frames of the drive or for none.
-            clock: measures the duration of front-end and odometry.
         """
         if self._ahead and isinstance(arrived, LoggedFrame):
             return arrived.frame, self._ahead.popleft()
@@ -246,12 +238,7 @@ class Front:
 
 
 def check_motion(motion: Motion | OutsideMotion) -> None:
-    """Refuses a motion that no robot makes: its position would rest on it from then on.
-
-    Raises:
-        InputError: it is not a rigid motion, too long, or another number is not finite, but for
-            `Motion.guessed_m`: without any source of motion it is infinite.
-    """
+    """Refuses a motion that no robot makes: its position would rest on it from then on."""
     shape: tuple[int, ...]
     if isinstance(motion, OutsideMotion):
         number, array, shape, most = motion.seconds, motion.rates_rad_s, (3,), _LONGEST_S
@@ -273,12 +260,7 @@ def check_motion(motion: Motion | OutsideMotion) -> None:
 
 
 def check_position(position: Position, graph: ExperienceGraph) -> None:
-    """Refuses a position at which no robot can be.
-
-    Raises:
-        InputError: it is something else, its numbers are not finite, or the graph does not contain
-            its node.
-    """
+    """Refuses a position at which no robot can be."""
     if not isinstance(position, Position):
         raise InputError(f"the place is a {type(position).__name__}, must be a Position")
     pose, covariance = position.node_from_live.matrix(), np.asarray(position.covariance)

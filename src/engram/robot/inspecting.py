@@ -24,11 +24,7 @@ from engram.places.words import vocabulary_problems
 
 
 def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
-    """Counts and properties of a map, for ``engram info``.
-
-    Raises:
-        MapError: the map cannot be read.
-    """
+    """Counts and properties of a map, for ``engram info``."""
     with Map.open(path, at=at) as store:
         info, totals = store.info(), store.totals()
         return {
@@ -54,11 +50,7 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
 
 
 def list_sessions(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
-    """The sessions of a map in order of arrival, for ``engram info --sessions``.
-
-    Raises:
-        MapError: the map cannot be read, or has no such revision.
-    """
+    """The sessions of a map in order of arrival, for ``engram info --sessions``."""
     with Map.open(path, at=at) as store:
         contents = store.load()
         frontends = store.frontends
@@ -87,11 +79,7 @@ def list_sessions(path: Path, at: int | str | None = None) -> list[dict[str, Any
 
 
 def list_nodes(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
-    """The nodes of a map in order of arrival, for ``engram info --nodes``.
-
-    Raises:
-        MapError: the map cannot be read, or has no such revision.
-    """
+    """The nodes of a map in order of arrival, for ``engram info --nodes``."""
     with Map.open(path, at=at) as store:
         graph, sessions = store.graph, store.sessions
     components, experiences = graph.components(), graph.experiences
@@ -121,15 +109,7 @@ def amend_session(
     """Corrects the robot, zone or start of a session, for ``engram amend``; see `Map.amend`.
 
     Args:
-        path: NAME.engram.
         session: its UUID, or an unambiguous prefix.
-        changes: field → its correct value.
-        author: author of the revision.
-
-    Raises:
-        InputError: the prefix matches no session or several, or nothing would change.
-        ConfigError: the zone is unknown.
-        MapError: the map cannot be written.
     """
     with Map.open(path) as store:
         found = store.named_session(session).id
@@ -145,11 +125,7 @@ def amend_session(
 
 
 def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:
-    """Checks a map for damage, for ``engram check``.
-
-    Raises:
-        MapError: the file is not a map, has a newer format, or is too damaged to open.
-    """
+    """Checks a map for damage, for ``engram check``."""
     removed = 0
     if clean:
         with Map.open(path, writes=True) as store:
@@ -171,11 +147,7 @@ def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:
 
 
 def seal_map(path: Path) -> list[dict[str, Any]]:
-    """Commits the saved part of interrupted sessions, for ``engram check --seal``.
-
-    Raises:
-        MapError: the map cannot be written.
-    """
+    """Commits the saved part of interrupted sessions, for ``engram check --seal``."""
     with Map.open(path, writes=True) as store:
         return [
             {
@@ -189,11 +161,7 @@ def seal_map(path: Path) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What an export wrote.
-
-    Attributes:
-        nodes, goals: how many of each.
-    """
+    """What an export wrote."""
 
     nodes: int
     goals: int
@@ -205,15 +173,9 @@ def export_map(
     """Writes where the nodes and goals of a map lie; the nodes session by session.
 
     Args:
-        path: the map.
         out: the file; its suffix gives the format unless `form` does.
         form: key of `FORMS`.
         at: revision; None for the newest.
-
-    Raises:
-        InputError: the format is not known, the map has no place on Earth for GeoJSON, or the file
-            cannot be written.
-        MapError: the map cannot be read, or has no such revision.
     """
     named = form or _SUFFIXES.get(out.suffix.lower(), "")
     if named not in FORMS:

@@ -35,7 +35,6 @@ class LocaliserParts(TypedDict, total=False):
         policy: key of `POLICIES`, or a policy.
         budget: attempts per frame; None for 2 lanes × 2 rounds.
         relocaliser: key of `RELOCALISERS`, or one that several drives share; None for none.
-        live: the live session.
         saves: whether the session is being mapped.
         threads: how many threads the lanes share; None for one each.
         matcher, search: replace the default ones; see `Localiser` and `MapParts`.
@@ -59,13 +58,8 @@ def localiser_in(
     """A localiser for one session in a map.
 
     Args:
-        opened: the map.
         camera: the live camera; it may differ from those of the map.
-        settings: the resolved configuration.
         **parts: what differs from the default; see `LocaliserParts`.
-
-    Raises:
-        ConfigError: the policy or the relocaliser is unknown.
     """
     policy = parts.get("policy", "recall")
     relocaliser = parts.get("relocaliser", "fabmap")
@@ -104,12 +98,10 @@ def relocaliser_in(opened: Map, name: str, descriptor: DescriptorKind) -> Reloca
     """The relocaliser of a map.
 
     Args:
-        opened: the map.
         name: key of `RELOCALISERS`.
         descriptor: kind of the live frames' descriptors; used while the map is empty.
 
     Raises:
-        ConfigError: the relocaliser is unknown.
         MapCorruptError: the vocabulary or a node's landmarks are damaged.
     """
     if name not in RELOCALISERS:
@@ -135,12 +127,7 @@ DriveSequence: TypeAlias = StereoSequence | FrameLog
 
 
 def session_of_drive(sequence: DriveSequence) -> Session:
-    """The session of a drive: the same drive read twice is the same session (method §2.7).
-
-    Raises:
-        InputError: the argument is a path or a list, not an opened drive.
-        SequenceError: the drive has no usable frame.
-    """
+    """The session of a drive: the same drive read twice is the same session (method §2.7)."""
     if not isinstance(sequence, StereoSequence | FrameLog):
         raise InputError(
             f"a value of {type(sequence).__name__} is not a drive: open a path with "

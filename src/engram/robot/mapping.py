@@ -71,14 +71,10 @@ def examine_drive(
     Open the drive with `skip_bad`: then bad pairs and stamps out of order are findings, not errors.
 
     Args:
-        sequence: the drive.
         settings: the resolved configuration; None for the defaults.
         monitor: receives each frame, and may stop the examination.
         by_hour: whether missions by hour need the drive's clock.
         seen: called with the number and the images of each frame that is examined.
-
-    Raises:
-        SequenceError: an image cannot be used.
     """
     front = Front(settings or Settings())
     evidence = front.examination.evidence
@@ -134,8 +130,6 @@ class LookedAhead:
 
     Args:
         front: takes the frames, and later those of the robot that drives on.
-        sequence: the drive.
-        monitor: may stop it.
     """
 
     def __init__(self, front: Front, sequence: DriveSequence, monitor: Monitor = QUIET) -> None:
@@ -225,13 +219,11 @@ class MapReport:
     """Result of mapping a drive.
 
     Attributes:
-        session: the drive.
         revision: number of the revision that holds it; None if it was interrupted.
         known: whether the map already held this drive, so that nothing was done.
         resumed: whether the run continued an earlier one.
         interrupted: whether the run was stopped; its progress is saved and can be resumed.
         skipped: pairs left out under `skip_bad`.
-        wrong_stamps: pairs left out for their stamp.
         diagnosis: what the doctor found in the first frames; None if nothing was done.
         results: one per live frame.
     """
@@ -363,11 +355,7 @@ def _written(map_path: Path) -> Iterator[Map]:
 
 
 def _check_features(asked: str, found: DescriptorKind | None, what: str, mend: str) -> None:
-    """Refuses a required kind of features that differs from the existing one.
-
-    Raises:
-        ConfigError: they differ.
-    """
+    """Refuses a required kind of features that differs from the existing one."""
     if found is not None and found != feature_kind(asked).name:
         raise ConfigError(
             f"{what} has {found} features, not {asked}; leave out --features and "
@@ -415,13 +403,11 @@ class ExtractReport:
     """Result of recording a drive.
 
     Attributes:
-        log: the file.
         frames: frames recorded by this run.
         already_recorded: frames that an earlier run had recorded.
         unusable: unusable frames: dark, covered, too few landmarks.
         without_motion: frames whose odometry failed.
         skipped: pairs left out under `skip_bad`.
-        bytes: size of the file.
         interrupted: whether the run was stopped; the same command continues it.
         diagnosis: what the doctor found in the first frames; a log holds no images for it to see.
     """
@@ -468,15 +454,8 @@ def extract_log(
     and recorded ones are not written twice. The result equals that of an uninterrupted run.
 
     Args:
-        sequence: a drive of images.
         out: NAME.framelog.
-        settings: settings of front-end and odometry.
         monitor: receives the status of each frame, and may stop the recording.
-
-    Raises:
-        SequenceError: the drive is already a frame log, or its images cannot be used.
-        IncompatibleError: the file is the log of another drive or of other frames.
-        MapError: the log cannot be written; what was recorded is intact.
     """
     report = ExtractReport(str(out))
     front = Front(settings)

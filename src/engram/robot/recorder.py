@@ -92,10 +92,8 @@ class Recorder:
 
     Attributes:
         folder: where records go, NAME.flight; made if missing.
-        info: facts of the drive.
         about: what is stored with each record, such as the map and its revision.
         images: whether images are kept; without them a record shows no people.
-        config: settings.
         written: the records, in the order of time.
         failure: why a record could not be written; "" if none failed.
     """
@@ -128,9 +126,6 @@ class Recorder:
 
         Args:
             arrived: the images, which are copied, or the logged frame.
-            frame: what was extracted from them.
-            found: the result.
-            outcomes: those of the attempts.
         """
         self._stamp_ns = frame.stamp_ns
         pair = None
@@ -148,11 +143,7 @@ class Recorder:
         self._write_unasked("withdrew a fix")
 
     def record(self, reason: str = "asked") -> Path:
-        """Writes what is kept to a file; `written` names it once it is there.
-
-        Args:
-            reason: stored with it.
-        """
+        """Writes what is kept to a file; `written` names it once it is there."""
         stamp = datetime.fromtimestamp(self._stamp_ns / 1e9, UTC).strftime("%Y%m%dT%H%M%S")
         names = (self.folder / f"{self.info.name}-{stamp}-{n}.flight" for n in count(1))
         path = next(name for name in names if name not in self._asked and not name.exists())

@@ -130,9 +130,6 @@ def load_settings(path: Path | None) -> Settings:
     """Settings from a TOML file; with None the defaults.
 
     The file may hold tables of the command line's verbs, such as ``merge``; they are left alone.
-
-    Raises:
-        ConfigError: the file cannot be read, or a setting is unknown or out of range.
     """
     settings = Settings() if path is None else _read_settings(path)
     return settings.for_descriptor(None)
@@ -147,11 +144,7 @@ def _read_settings(path: Path) -> Settings:
 
 
 def settings_text(path: Path) -> str:
-    """The text of a settings file, or of one that ships with the package, by its name.
-
-    Raises:
-        ConfigError: the file cannot be read.
-    """
+    """The text of a settings file, or of one that ships with the package, by its name."""
     if str(path) in PAPERS and not path.exists():
         return (files("engram.robot") / "papers" / f"{path}.toml").read_text(encoding="utf-8")
     try:

@@ -54,10 +54,6 @@ class SessionHeader:
     """A drive, as the revision that saves it states it.
 
     Attributes:
-        session: the drive.
-        camera: its camera.
-        descriptor: kind of its descriptors.
-        frontend: hash of its front-end.
         configuration: the resolved settings, plain JSON data.
         message: text for ``log``.
         author: the person or robot; empty for the robot.
@@ -72,12 +68,7 @@ class SessionHeader:
     author: str = ""
 
     def begin(self, opened: Map) -> RevisionWriter:
-        """Begins the session in a map that is open for writing.
-
-        Raises:
-            RevisionError: the map has it already, committed or interrupted.
-            MapError: it cannot be written.
-        """
+        """Begins the session in a map that is open for writing."""
         return opened.begin_session(
             self.session,
             self.camera,
@@ -100,11 +91,7 @@ class Spool:
 
     Args:
         map_path: the map; the file lies next to it.
-        header: the drive.
         most_bytes: largest size; later records are dropped.
-
-    Raises:
-        MapError: the file cannot be written.
     """
 
     def __init__(self, map_path: Path, header: SessionHeader, most_bytes: int) -> None:
@@ -180,7 +167,6 @@ def commit_spools(map_path: Path) -> dict[Path, Revision]:
 
     Raises:
         MapLockedError: another process writes to the map; the memories wait.
-        MapError: the map cannot be written, or a memory cannot be read.
     """
     spools = sorted(map_path.parent.glob(f"{glob.escape(map_path.name)}-memory-*"))
     if not spools:

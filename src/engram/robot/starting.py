@@ -46,16 +46,9 @@ def robot_on(
     """A robot that localises a drive in a map, and saves no nodes.
 
     Args:
-        opened: the map.
         sequence: the drive, for `Robot.drive`.
-        settings: the resolved configuration.
         options: ranking policy and budget; None for the defaults.
-        policy: replaces that of the options.
         remembers: whether path and attempts are kept as a session; see `Map.robot`.
-
-    Raises:
-        ConfigError: the policy or the relocaliser is unknown, or the threads are too few.
-        SequenceError: the drive has no usable frame.
     """
     options, settings = options or RobotOptions(), settings.for_descriptor(opened.descriptor)
     session = session_of_drive(sequence)
@@ -124,8 +117,6 @@ def _saving_in(opened: Map, setup: RobotSetup, *, maps: bool) -> Saving:
     Where that cannot be written, the robot localises and saves nothing.
 
     Raises:
-        ConfigError: the robot has no name.
-        RevisionError: the map was opened at a named revision.
         MapLockedError: another process writes to the map.
     """
     if setup.name is None:
@@ -142,11 +133,7 @@ def _saving_in(opened: Map, setup: RobotSetup, *, maps: bool) -> Saving:
 
 
 def _check_newest(opened: Map) -> None:
-    """Refuses to keep drives in a map opened at an older revision.
-
-    Raises:
-        RevisionError: the map was opened at a named revision.
-    """
+    """Refuses to keep drives in a map opened at an older revision."""
     if opened.is_pinned:
         raise RevisionError(
             f"{opened.location} is open at revision {opened.revision}; to keep drives, open it "

@@ -42,11 +42,8 @@ class VocabularyReport:
     """Properties of a map's vocabulary.
 
     Attributes:
-        descriptor: kind of its words.
-        words: number of words.
         images: number of training frames.
         hash: 32 hexadecimal digits that identify it.
-        trained_on: description of the training data.
         default: whether it is the vocabulary that ships with the package.
         revision: number of the revision that stored it; None if none was stored.
     """
@@ -78,11 +75,7 @@ def describe_vocabulary(map_path: Path, at: int | str | None = None) -> Vocabula
     """Describes the vocabulary that relocalises robots in a map.
 
     Args:
-        map_path: the map.
         at: number or tag of its revision; None for the newest.
-
-    Raises:
-        MapError: the map cannot be read, or has no such revision.
     """
     with Map.open(map_path, at=at) as opened:
         found = vocabulary_or_default(opened, BRIEF)
@@ -100,16 +93,7 @@ def train_map_vocabulary(
     """Trains a vocabulary and stores it in a map, as a revision of its own.
 
     Args:
-        map_path: the map.
         sources: maps and drives to train on; if empty, the map itself.
-        config: settings of the training.
-        author: author of the revision.
-        monitor: receives each stage of the work.
-
-    Raises:
-        InputError: too few descriptors for this number of words.
-        IncompatibleError: a source has another kind of descriptor than the map.
-        MapError: a source cannot be read, or the map cannot be written.
     """
     with Map.open(map_path) as store:
         kind = store.descriptor
@@ -153,15 +137,7 @@ def use_vocabulary(
     Maps of a fleet that share a vocabulary share the words of their nodes.
 
     Args:
-        map_path: the map.
         source: a map with a vocabulary, or an encoded vocabulary.
-        author: author of the revision.
-        monitor: receives each stage of the work.
-
-    Raises:
-        InputError: the source has no vocabulary of its own.
-        IncompatibleError: its words are for another kind of descriptor than the map's.
-        MapError: the source cannot be read, or the map cannot be written.
     """
     vocabulary = _read_vocabulary(source)
     with Map.open(map_path, writes=True) as writable:
