@@ -10,14 +10,13 @@ from pathlib import Path
 # they do by spinning. Set before NumPy is loaded, and inherited by all processes that tests start.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import cv2
 import hypothesis
 import pytest
+from tests.builders import TOWN, TOWN_ROAD, drive, map_simulated, write_street
 
 from engram.robot.mapping import map_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.sequences.opening import open_drive
-from engram_lab.bench.data import synthetic_drive
 
 # A busy machine is no failure: no test has a time limit.
 hypothesis.settings.register_profile("engram", deadline=None, print_blob=True, max_examples=30)
@@ -60,21 +59,7 @@ def data_dir() -> Path:
 @pytest.fixture(scope="session")
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Twelve pairs of a rendered street in the plain layout."""
-    folder = tmp_path_factory.mktemp("drives") / "street"
-    pairs = synthetic_drive(frames=12, step_m=0.8)
-    camera = pairs[0].camera
-    for side in ("left", "right"):
-        (folder / side).mkdir(parents=True)
-        for number, pair in enumerate(pairs):
-            cv2.imwrite(str(folder / side / f"{number:06d}.png"), getattr(pair, side))
-    stamps = "".join(f"{number / 10:.6f}\n" for number in range(len(pairs)))
-    (folder / "times.txt").write_text(stamps)
-    values = [
-        f"{name} = {getattr(camera, name)}"
-        for name in ("width", "height", "fx", "fy", "cx", "cy", "baseline_m")
-    ]
-    (folder / "calibration.toml").write_text("\n".join(["[rectified]", *values]) + "\n")
-    return folder
+    return write_street(tmp_path_factory.mktemp("drives") / "street", frames=12)
 
 
 @pytest.fixture(scope="session")
@@ -82,4 +67,12 @@ def mapped_street(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     """A map of the street, to be read; a test that writes copies it."""
     path = tmp_path_factory.mktemp("maps") / "town.engram"
     map_drive(path, open_drive(street), Settings(), RobotOptions())
+    return path
+
+
+@pytest.fixture(scope="session")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of `TOWN`, driven once along `TOWN_ROAD`; to be read."""
+    path = tmp_path_factory.mktemp("town") / "town.engram"
+    map_simulated(path, drive(TOWN, TOWN_ROAD))
     return path

@@ -5,10 +5,25 @@ from __future__ import annotations
 import numpy as np
 
 from engram.frontend.frame import BRIEF, Frame, FrameStatus, Landmarks
+from engram.frontend.matching import MatcherConfig
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 
 CAMERA = StereoCamera(fx=300.0, fy=300.0, cx=255.0, cy=190.0, baseline_m=0.3, width=512, height=384)
+# What the scenes' noise is: independent, without a common offset.
+AS_SIMULATED = MatcherConfig(
+    pixel_sigma_px=0.5,
+    disparity_sigma_px=1e-6,
+    offset_sigma_px=1e-3,
+    offset_drift_px=1e-3,
+    independent_landmarks=1e9,
+    few_inliers=0,
+    displaced_m=0,
+    offset_doubt=0,
+    calibration_share=0,
+    calibration_m=0,
+    calibration_rad=0,
+)
 
 
 class Scene:

@@ -21,13 +21,13 @@ import numpy as np
 import pytest
 import typer
 import yaml
+from tests.builders import write_street
 
 import engram
 from engram import errors
 from engram.cli.app import app, main
 from engram.sample.drives import write_drives
 from engram.sequences.opening import SEQUENCES
-from engram_lab.bench.data import synthetic_drive
 
 ROOT = Path(__file__).parent.parent
 README, DOCS = ROOT / "README.md", ROOT / "docs"
@@ -98,21 +98,7 @@ def blocks(page: Path) -> list[Block]:
 @pytest.fixture(scope="session")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Thirty pairs of a rendered street in the plain layout."""
-    folder = tmp_path_factory.mktemp("shown") / "street"
-    pairs = synthetic_drive(frames=30, step_m=0.8)
-    camera = pairs[0].camera
-    for side in ("left", "right"):
-        (folder / side).mkdir(parents=True)
-        for number, pair in enumerate(pairs):
-            cv2.imwrite(str(folder / side / f"{number:06d}.png"), getattr(pair, side))
-    stamps = "".join(f"{number / 10:.6f}\n" for number in range(len(pairs)))
-    (folder / "times.txt").write_text(stamps)
-    values = [
-        f"{name} = {getattr(camera, name)}"
-        for name in ("width", "height", "fx", "fy", "cx", "cy", "baseline_m")
-    ]
-    (folder / "calibration.toml").write_text("\n".join(["[rectified]", *values]) + "\n")
-    return folder
+    return write_street(tmp_path_factory.mktemp("shown") / "street", frames=30)
 
 
 @pytest.fixture

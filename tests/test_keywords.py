@@ -6,7 +6,7 @@ import dataclasses
 import inspect
 
 import pytest
-from tests.synthetic_world import CAMERA
+from tests.builders import CAMERA
 
 import engram
 from engram.cli.options import Effort

@@ -10,11 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.builders import World, covariance_of, drive, forward, localised, make_edge, map_simulated
 from tests.fleet.robots import OPTIONS, merged, robot_map
 from tests.fleet.test_updating import Content
-from tests.mapping_rig import localised, map_simulated
-from tests.synthetic_world import World, drive
-from tests.worlds import covariance_of, forward, make_edge
 
 from engram.cli.options import Effort
 from engram.cli.settings import every_setting, read_settings

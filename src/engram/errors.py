@@ -24,6 +24,8 @@ Not localising is never an error: it is a status of the result.
 """
 
 import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
 class EngramError(Exception):
@@ -92,6 +94,20 @@ class WorkerError(EngramError):
 
 class MissingExtraError(EngramError, ImportError):
     """An optional dependency is not installed."""
+
+
+@contextmanager
+def extra(name: str, need: str) -> Iterator[None]:
+    """Context of an optional import: a missing package is reported with its pip command.
+
+    Args:
+        name: the extra that has the package.
+        need: the beginning of the message, such as "pictures need Matplotlib".
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise MissingExtraError(f"{need}: pip install 'engram-localisation[{name}]'") from error
 
 
 def storage_full(error: OSError, where: object) -> StorageFullError | None:

@@ -149,7 +149,7 @@ def measure_all(left: np.ndarray, right: np.ndarray, positions: np.ndarray, **ch
 @pytest.mark.parametrize("sides_differ", [False, True])
 @pytest.mark.parametrize("noise", [0.0, 4.0])
 def test_disparities_equal_the_definition(noise: float, sides_differ: bool) -> None:
-    left, right = shifted_pair(100, 220, 12.25, seed=10, noise=noise)
+    left, right = shifted_pair(68, 220, 12.25, seed=10, noise=noise)
     right[:, 100:110] = 40  # an occluder, so that some are refused
     if sides_differ:
         right = darker(right, 0.4)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.builders import CAMERA, Seen, World, drive
 from tests.scenes import Scene
-from tests.synthetic_world import CAMERA, Seen, World, drive
 
 from engram.doctor.examination import APART, MOST, Examination, Rematched
 from engram.doctor.table import Finding

@@ -36,6 +36,14 @@ def in_this_process(work, tasks, workers, monitor, done):
         monitor.check()
 
 
+class KilledError(Exception):
+    """What lies on the disk is as if the process had been killed here."""
+
+
+def killed(*_: object, **__: object) -> None:
+    raise KilledError
+
+
 class Interrupting(Monitor):
     """Presses Ctrl-C after so many frames."""
 

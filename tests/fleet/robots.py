@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from tests.mapping_rig import Mapped, map_simulated
-from tests.synthetic_world import World, drive
+from tests.builders import Mapped, World, drive, map_simulated
 
 from engram.fleet.merge.merge_settings import MergeOptions
 from engram.fleet.merge.merging import merge

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.worlds import attempts_of
+from tests.builders import attempts_of
 
 from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions

@@ -8,8 +8,7 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
-from tests.mapping_rig import map_simulated
-from tests.synthetic_world import PERIOD_NS, drive
+from tests.builders import PERIOD_NS, drive, map_simulated
 
 from engram.fleet.merge.replay import Segment, position_behind_gap
 from engram.fleet.merge.report import Seed

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import map_simulated
-from tests.synthetic_world import drive
+from tests.builders import drive, map_simulated
 
 from engram.fleet.download.coverage import (
     Coverage,

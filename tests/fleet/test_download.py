@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.mapping_rig import localise_simulated, map_simulated
-from tests.synthetic_world import drive
-from tests.worlds import attempts_of
+from tests.builders import attempts_of, drive, localise_simulated, map_simulated
 
 from engram.errors import ConfigError, InputError, MapError, NotAMapError, RevisionError
 from engram.fleet.download.downloading import DownloadReport, download, most_that_fit

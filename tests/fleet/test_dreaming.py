@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import random
 import shutil
-import signal
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from sqlalchemy import Engine, event
-from tests.mapping_rig import map_simulated
-from tests.synthetic_world import World, drive
+from tests.builders import World, dies_before, drive, map_simulated
 
 from engram.errors import ConfigError, InputError
 from engram.fleet.build.orders import JudgeOptions
@@ -169,28 +165,6 @@ def test_a_stopped_dream_goes_on_to_the_same_result(town, tmp_path, checks):
     assert nodes_of(centre) == nodes_of(fresh)
 
 
-def dreams_till_killed(
-    statement: int, centre: Path, robots: list[Path], drives: list[Path]
-) -> bool:
-    """Dreams in a child that dies before its n-th statement; whether it died."""
-    child = os.fork()
-    if child:
-        return os.WIFSIGNALED(os.waitpid(child, 0)[1])
-    left = statement
-
-    def die(*_: object) -> None:
-        nonlocal left
-        left -= 1
-        if left < 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    try:
-        event.listen(Engine, "before_cursor_execute", die)
-        dream(centre, robots, drives, options=ASKED)
-    finally:
-        os._exit(0)
-
-
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")
 def test_killed_at_random_a_dream_goes_on_to_the_same_result(town, tmp_path):
@@ -198,7 +172,7 @@ def test_killed_at_random_a_dream_goes_on_to_the_same_result(town, tmp_path):
     fresh = Path(shutil.copy(town[0], tmp_path / "fresh.engram"))
     whole = dream(fresh, robots, drives, options=ASKED)
     rng, kills = random.Random(7), 0
-    while dreams_till_killed(rng.randrange(9000), centre, robots, drives):
+    while dies_before(rng.randrange(9000), lambda: dream(centre, robots, drives, options=ASKED)):
         kills += 1
         assert nodes_of(centre) in (nodes_of(town[0]), nodes_of(fresh))
         assert check_file(centre).problems == ()

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import map_simulated
-from tests.synthetic_world import World, drive, see
-from tests.worlds import attempts_of
+from tests.builders import World, attempts_of, drive, map_simulated, see
 
 from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import map_simulated
+from tests.builders import map_simulated
 
 from engram.errors import ConfigError, InputError
 from engram.fleet.download.coverage import (

@@ -20,16 +20,8 @@ from engram.robot.mapping import map_drive
 from engram.robot.settings import Settings
 from engram.sequences.opening import open_drive
 
-from .builds import build, in_this_process, judge, options
+from .builds import KilledError, build, in_this_process, judge, killed, options
 from .robots import OPTIONS
-
-
-class KilledError(Exception):
-    """What lies on the disk is as if the process had been killed here."""
-
-
-def killed(*_: object, **__: object) -> None:
-    raise KilledError
 
 
 @pytest.fixture(autouse=True)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import random
 import shutil
-import signal
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import Engine, event
+from tests.builders import dies_before
 from tests.maps.frames import CAMERA, FRONTEND
 from tests.maps.maps import attempt, begin, edge, node, node_frame, session
 
@@ -357,24 +355,12 @@ def test_a_file_that_was_downloaded_is_a_source_too(tmp_path):
 
 def killed_at(statement: int, centre: Path, robot: Path, options: DownloadOptions = WHOLE) -> bool:
     """Runs an update in a child that dies before its n-th statement; whether it died."""
-    child = os.fork()
-    if child:
-        _, status = os.waitpid(child, 0)
-        return os.WIFSIGNALED(status)
-    left = statement
 
-    def die(*_: object) -> None:
-        nonlocal left
-        left -= 1
-        if left < 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    try:
+    def work() -> None:
         writer._BATCH_BYTES = 2000  # several checkpoints
-        event.listen(Engine, "before_cursor_execute", die)
         update(centre, robot, options)
-    finally:
-        os._exit(0)
+
+    return dies_before(statement, work)
 
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")

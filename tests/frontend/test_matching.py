@@ -6,7 +6,7 @@ from uuid import UUID
 import numpy as np
 import pytest
 from tests.instruction_sets import printed
-from tests.scenes import CAMERA, Scene, normalised_error
+from tests.scenes import AS_SIMULATED, CAMERA, Scene, normalised_error
 
 from engram import _core
 from engram.errors import ConfigError, IncompatibleError, InputError
@@ -23,20 +23,6 @@ from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 
 CONFIG = MatcherConfig()
-# What the scenes' noise is: independent, without a common offset.
-AS_SIMULATED = MatcherConfig(
-    pixel_sigma_px=0.5,
-    disparity_sigma_px=1e-6,
-    offset_sigma_px=1e-3,
-    offset_drift_px=1e-3,
-    independent_landmarks=1e9,
-    few_inliers=0,
-    displaced_m=0,
-    offset_doubt=0,
-    calibration_share=0,
-    calibration_m=0,
-    calibration_rad=0,
-)
 REFERENCE_FROM_LIVE = SE3.exp([0.2, -0.05, 1.0, 0.02, 0.1, 0.01])
 WIDER = StereoCamera(fx=220.0, fy=225.0, cx=330.0, cy=236.0, baseline_m=0.5, width=640, height=480)
 

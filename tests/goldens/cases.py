@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from tests.builders import write_street
 from tests.goldens import through
 from tests.goldens.results import Case, found_case, measured_case
 
@@ -112,7 +113,7 @@ def data(name: str) -> Path:
 
 
 def street(group: Group) -> None:
-    path = group.drive("street", through.write_street(group.folder / "street"))
+    path = group.drive("street", write_street(group.folder / "street", frames=12))
     group.measure("measure", path)
     even = group.map("map", group.folder / "even.engram", path, frames="::2")
     group.localise("localise", even, path, frames="1::2")

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from platformdirs import user_cache_path
 
@@ -30,7 +29,6 @@ from engram.robot.mapping import map_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import localise_drive
 from engram.sequences.opening import open_drive
-from engram_lab.bench.data import synthetic_drive
 from engram_lab.there_and_back import ThereAndBack
 from engram_lab.town.campaigns import campaign_named
 from engram_lab.town.simulating import simulate
@@ -46,22 +44,6 @@ def rendered(campaign: str, sessions: list[int]) -> list[Path]:
     folder = Path(named) if named else user_cache_path("engram") / "campaigns"
     report = simulate(campaign_named(campaign), folder, sessions=sessions)
     return [Path(file) for file in report.files]
-
-
-def write_street(folder: Path) -> Path:
-    """Twelve pairs of a street of planes, in the plain layout."""
-    pairs = synthetic_drive(frames=12, step_m=0.8)
-    camera = pairs[0].camera
-    for side in ("left", "right"):
-        (folder / side).mkdir(parents=True)
-        for number, pair in enumerate(pairs):
-            cv2.imwrite(str(folder / side / f"{number:06d}.png"), getattr(pair, side))
-    stamps = "".join(f"{number / 10:.6f}\n" for number in range(len(pairs)))
-    (folder / "times.txt").write_text(stamps)
-    names = ("width", "height", "fx", "fy", "cx", "cy", "baseline_m")
-    lines = ["[rectified]", *(f"{name} = {getattr(camera, name)}" for name in names), ""]
-    (folder / "calibration.toml").write_text("\n".join(lines))
-    return folder
 
 
 def drive(path: Path, there_and_back: int | None = None, **how: Any) -> DriveSequence:

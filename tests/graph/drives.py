@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from tests.worlds import covariance_of
+from tests.builders import covariance_of
 
 from engram.geometry.se3 import SE3, propagate_covariance
 from engram.graph.graph import ExperienceGraph

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from tests.builders import covariance_of, forward
 from tests.reference import chain_error as oracle
 from tests.reference.chain_error import error_of
 from tests.reference.graph_search import variance_at
-from tests.worlds import covariance_of, forward
 
 from engram.errors import InputError
 from engram.geometry.se3 import SE3, propagate_covariance

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.builders import covariance_of, forward, make_edge
 from tests.reference import graph_search as oracle
-from tests.worlds import covariance_of, forward, make_edge
 
 from engram.errors import InputError
 from engram.geometry.se3 import SE3

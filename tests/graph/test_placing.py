@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.worlds import covariance_of
+from tests.builders import covariance_of
 
 from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from tests.builders import covariance_of, forward, make_edge
 from tests.graph.drives import Fleet, Route, Tally
-from tests.worlds import covariance_of, forward, make_edge
 
 from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph

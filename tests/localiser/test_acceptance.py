@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from tests.synthetic_world import World, see
+from tests.builders import World, see
 
 from engram.frontend.matching import Match
 from engram.geometry.se3 import SE3

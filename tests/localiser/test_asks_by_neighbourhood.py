@@ -11,10 +11,8 @@ that is read page by page. What still looks at the whole map, and when:
 
 from pathlib import Path
 
-import numpy as np
 import pytest
-from tests.mapping_rig import localised, map_simulated
-from tests.synthetic_world import World, drive
+from tests.builders import TOWN, TOWN_ROAD, drive, localised
 
 from engram.graph.graph import ExperienceGraph
 from engram.graph.paths import PathMemory
@@ -23,9 +21,6 @@ from engram.maps.map import Map
 from engram.ranking.policies import POLICIES
 from engram.robot.localisers import localiser_in
 from engram.robot.settings import Settings
-
-WORLD = World(30.0)
-ROAD = np.arange(0.0, 25.0, 0.7)
 
 
 class EnumeratedError(AssertionError):
@@ -59,16 +54,9 @@ class AskedPaths(PathMemory):
     paths = _refuse("paths")
 
 
-@pytest.fixture(scope="module")
-def town(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("town") / "town.engram"
-    map_simulated(path, drive(WORLD, ROAD))
-    return path
-
-
 @pytest.mark.parametrize("policy", sorted(POLICIES))
 def test_the_localising_loop_enumerates_nothing(town: Path, policy: str) -> None:
-    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)
+    live = drive(TOWN, TOWN_ROAD, seed=1, start_ns=10**15)
     with (
         Map.open(town) as opened,
         localiser_in(

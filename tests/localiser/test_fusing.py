@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.builders import TOWN, TOWN_ROAD, drive
 from tests.localiser.test_hypotheses import GRAPH, SURE, ahead
-from tests.mapping_rig import map_simulated
-from tests.synthetic_world import World, drive
 
 from engram.frontend.frame import BRIEF
 from engram.geometry.se3 import SE3
@@ -134,21 +133,18 @@ def test_the_mean_is_nearer_to_the_truth_where_errors_are_as_claimed() -> None:
     [(Rule.CONFIDENCE, True, True), (Rule.CONFIDENCE, False, False), (Rule.INLIERS, True, False)],
 )
 def test_a_robot_is_told_the_mean_where_matches_are_weak_but_by_the_published_rule(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rule: Rule, *, weak: bool, means: bool
+    town: Path, monkeypatch: pytest.MonkeyPatch, rule: Rule, *, weak: bool, means: bool
 ) -> None:
     if weak:
         model = replace(CONFIDENCES[BRIEF], weak_inliers=10**6)
         monkeypatch.setitem(CONFIDENCES, BRIEF, model)
-    world, road = World(30.0), np.arange(0.0, 25.0, 0.7)
-    path = tmp_path / "town.engram"
-    map_simulated(path, drive(world, road))
-    live = drive(world, road, seed=1, start_ns=10**15)
+    live = drive(TOWN, TOWN_ROAD, seed=1, start_ns=10**15)
     localising = Settings().localiser
     acceptance = replace(localising.acceptance, rule=rule)
     settings = replace(Settings(), localiser=replace(localising, acceptance=acceptance))
     fused_at = []
     with (
-        Map.open(path) as opened,
+        Map.open(town) as opened,
         localiser_in(
             opened, live[0].frame.camera, settings, policy="distance", relocaliser=None
         ) as localiser,

@@ -6,9 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.mapping_rig import localised, map_simulated
-from tests.synthetic_world import CAMERA, Seen, World, drive, see
-from tests.worlds import covariance_of, forward, make_edge
+from tests.builders import (
+    CAMERA,
+    Seen,
+    World,
+    covariance_of,
+    drive,
+    forward,
+    localised,
+    make_edge,
+    map_simulated,
+    see,
+)
 
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import localised, map_simulated
-from tests.synthetic_world import PERIOD_NS, Seen, World, drive
+from tests.builders import PERIOD_NS, TOWN, TOWN_ROAD, Seen, World, drive, localised, map_simulated
 
 from engram.errors import MapCorruptError
 from engram.localiser.attempts import Lanes, one_by_one
@@ -18,9 +17,6 @@ from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
 from engram.robot.robot import Robot
 from engram.robot.settings import Settings
-
-WORLD = World(30.0)
-ROAD = np.arange(0.0, 25.0, 0.7)
 
 
 class _Counting(Lanes):
@@ -49,12 +45,10 @@ class _Foreseeing:
 
 
 def test_a_given_matcher_makes_all_attempts_and_a_given_search_finds_all_candidates(
-    tmp_path: Path,
+    town: Path,
 ) -> None:
-    path = tmp_path / "town.engram"
-    map_simulated(path, drive(WORLD, ROAD))
-    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)
-    with Map.open(path) as opened:
+    live = drive(TOWN, TOWN_ROAD, seed=1, start_ns=10**15)
+    with Map.open(town) as opened:
         matcher = _Counting(opened.frames, Settings().localiser.matcher)
         searched = []
 
@@ -80,15 +74,13 @@ def test_a_given_matcher_makes_all_attempts_and_a_given_search_finds_all_candida
 
 
 def test_a_robot_whose_odometry_sees_nothing_is_taken_to_go_on_within_a_bounded_radius(
-    tmp_path: Path,
+    town: Path,
 ) -> None:
-    path = tmp_path / "town.engram"
-    map_simulated(path, drive(WORLD, ROAD))
-    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)
-    elsewhere = drive(World(30.0, seed=9), ROAD, seed=2, start_ns=10**15)
+    live = drive(TOWN, TOWN_ROAD, seed=1, start_ns=10**15)
+    elsewhere = drive(World(30.0, seed=9), TOWN_ROAD, seed=2, start_ns=10**15)
     blind = OdometryStep(OdometryStatus.TOO_FEW_MATCHES)
     radii_m = []
-    with Map.open(path) as opened:
+    with Map.open(town) as opened:
 
         def search(*args):
             radii_m.append(args[-1].radius_m)
@@ -122,14 +114,12 @@ def test_a_robot_whose_odometry_sees_nothing_is_taken_to_go_on_within_a_bounded_
     assert radii_m[0] < 10.0 < max(radii_m) == settings.localiser.max_search_radius_m
 
 
-def test_what_is_foreseen_is_what_attempts_come_to(tmp_path: Path, monkeypatch) -> None:
-    path = tmp_path / "town.engram"
-    map_simulated(path, drive(WORLD, ROAD))
-    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)[:10]
+def test_what_is_foreseen_is_what_attempts_come_to(town: Path, monkeypatch) -> None:
+    live = drive(TOWN, TOWN_ROAD, seed=1, start_ns=10**15)[:10]
     policy = _Foreseeing()
     monkeypatch.setitem(POLICIES, policy.name, lambda: policy)
     with (
-        Map.open(path) as opened,
+        Map.open(town) as opened,
         localiser_in(
             opened,
             live[0].frame.camera,
@@ -166,14 +156,12 @@ class _Damaged(Lanes):
         return super().match(live, live_id, node, guide)
 
 
-def test_what_is_damaged_is_foreseen_to_fail(tmp_path: Path, monkeypatch) -> None:
-    path = tmp_path / "town.engram"
-    map_simulated(path, drive(WORLD, ROAD))
-    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)[:2]
+def test_what_is_damaged_is_foreseen_to_fail(town: Path, monkeypatch) -> None:
+    live = drive(TOWN, TOWN_ROAD, seed=1, start_ns=10**15)[:2]
     policy = _Foreseeing()
     monkeypatch.setitem(POLICIES, policy.name, lambda: policy)
     with (
-        Map.open(path) as opened,
+        Map.open(town) as opened,
         localiser_in(
             opened,
             live[0].frame.camera,
@@ -210,14 +198,12 @@ class _All:
 
 
 def test_a_lost_robot_has_a_budget_of_its_own_and_a_matcher_that_gives_up_sooner(
-    tmp_path: Path,
+    town: Path,
 ) -> None:
-    path = tmp_path / "town.engram"
-    map_simulated(path, drive(WORLD, ROAD))
-    live = drive(WORLD, ROAD, seed=1, start_ns=10**15)
+    live = drive(TOWN, TOWN_ROAD, seed=1, start_ns=10**15)
     relocaliser = _All()
     with (
-        Map.open(path) as opened,
+        Map.open(town) as opened,
         localiser_in(
             opened,
             live[0].frame.camera,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.synthetic_world import World, see
+from tests.builders import World, see
 
 from engram.errors import IncompatibleError
 from engram.frontend.features import NET

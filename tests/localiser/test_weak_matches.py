@@ -7,7 +7,7 @@ from uuid import UUID
 
 import numpy as np
 import pytest
-from tests.synthetic_world import World, see
+from tests.builders import World, see
 
 from engram.frontend.frame import BRIEF, Frame
 from engram.frontend.matching import Match

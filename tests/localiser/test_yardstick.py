@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import map_simulated
-from tests.synthetic_world import World, drive
+from tests.builders import World, drive, map_simulated
 
 from engram.localiser.yardstick import Likeness, LookalikeConfig, Run
 from engram.maps.map import Map

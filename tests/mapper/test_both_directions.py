@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import localised, map_simulated
-from tests.synthetic_world import Seen, World, see
+from tests.builders import Seen, World, localised, map_simulated, see
 
 from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.worlds import forward, make_edge
+from tests.builders import forward, make_edge
 
 from engram.frontend.matching import Match
 from engram.geometry.se3 import SE3

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
-from tests.worlds import forward, make_edge
+from tests.builders import forward, make_edge
 
 from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph

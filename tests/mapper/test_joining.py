@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import map_simulated
-from tests.synthetic_world import PERIOD_NS, Seen, World, drive
+from tests.builders import PERIOD_NS, Seen, World, drive, map_simulated
 
 from engram.geometry.se3 import SE3
 from engram.maps.map import Map, open_map

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import Mapped, map_simulated
-from tests.synthetic_world import World, drive, see
+from tests.builders import Mapped, World, drive, map_simulated, see
 
 from engram.errors import MapCorruptError
 from engram.geometry.se3 import SE3

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import Mapped, errors_m, localise_simulated, map_simulated
-from tests.synthetic_world import World, drive
+from tests.builders import Mapped, World, drive, errors_m, localise_simulated, map_simulated
 
 from engram.frontend.frame import FrameStatus
 from engram.geometry.se3 import SE3

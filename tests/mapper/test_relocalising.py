@@ -6,20 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
-from tests.mapping_rig import errors_m, localise_simulated, map_simulated
-from tests.synthetic_world import World, drive
+from tests.builders import World, drive, errors_m, localise_simulated, map_simulated
 
 from engram.localiser.localisation import LocalisationStatus
 
 ROAD = World(length_m=120.0, seed=11)
 ELSEWHERE = World(length_m=60.0, seed=12)
-
-
-@pytest.fixture(scope="module")
-def mapped(tmp_path_factory: pytest.TempPathFactory):
-    path = tmp_path_factory.mktemp("maps") / "road.engram"
-    return path, map_simulated(path, drive(ROAD, np.arange(0, 100, 1.0)))
 
 
 def test_a_cold_start_anywhere_is_found_at_once(mapped) -> None:

@@ -6,7 +6,7 @@ from uuid import UUID
 
 import numpy as np
 import pytest
-from tests.synthetic_world import World, drive
+from tests.builders import World, drive
 
 from engram.frontend.matching import Match
 from engram.geometry.cameras import CameraId

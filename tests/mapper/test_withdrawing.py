@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import map_simulated, session_for
-from tests.synthetic_world import Seen, World, drive
+from tests.builders import Mapped, Seen, World, drive, session_for
 
 from engram.frontend.frame import Frame
 from engram.frontend.matching import NO_MATCH, Match
@@ -74,11 +74,9 @@ class Notes:
         """Nothing to do."""
 
 
-@pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("maps") / "road.engram"
-    map_simulated(path, drive(ROAD, np.arange(0, 100, 1.0)))
-    return path
+@pytest.fixture
+def town(mapped: tuple[Path, Mapped], tmp_path: Path) -> Path:
+    return Path(shutil.copy(mapped[0], tmp_path))
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.worlds import attempts_of
+from tests.builders import attempts_of
 
 from engram.errors import FormatVersionError, IncompatibleError
 from engram.frontend.frame import BRIEF, TEBLID

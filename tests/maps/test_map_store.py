@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 from sqlalchemy import insert
-from tests.worlds import attempts_of
+from tests.builders import attempts_of
 
 from engram.errors import IncompatibleError, InputError, MapError, MapLockedError, RevisionError
 from engram.frontend.frame import BRIEF, TEBLID

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sqlalchemy import insert
-from tests.worlds import attempts_of
+from tests.builders import attempts_of
 
 from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.frontend.frame import BRIEF, TEBLID

@@ -4,11 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.scenes import CAMERA, Scene, normalised_error
+from tests.scenes import AS_SIMULATED, CAMERA, Scene, normalised_error
 
 from engram.errors import ConfigError, IncompatibleError
 from engram.frontend.frame import TEBLID, Frame, FrameStatus
-from engram.frontend.matching import MatcherConfig
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram.odometry.odometry import Odometry, OdometryConfig, WindowConfig
@@ -16,21 +15,9 @@ from engram.odometry.step import OdometryStatus
 
 MOTION = SE3.exp([0.03, 0.0, 0.4, 0.0, 0.015, 0.002])
 INTERVAL_NS = 100_000_000
-# What the scenes' noise is: independent, without a common offset.
-AS_SIMULATED = OdometryConfig(
-    matcher=MatcherConfig(
-        pixel_sigma_px=0.5,
-        disparity_sigma_px=1e-6,
-        offset_sigma_px=1e-3,
-        offset_drift_px=1e-3,
-        independent_landmarks=1e9,
-        few_inliers=0,
-        displaced_m=0,
-        offset_doubt=0,
-        calibration_share=0,
-        calibration_m=0,
-        calibration_rad=0,
-    ),
+# The noise of the scenes.
+AS_DRIVEN = OdometryConfig(
+    matcher=AS_SIMULATED,
     window=WindowConfig(offset_sigma_px=1e-3),
     few_inliers=0,
 )
@@ -55,7 +42,7 @@ def test_follows_a_drive_with_honest_covariance() -> None:
     errors = []
     for seed in range(4):
         frames, _ = drive(12, seed)
-        odometry = Odometry(AS_SIMULATED)
+        odometry = Odometry(AS_DRIVEN)
         steps = [odometry.step(frame) for frame in frames]
         assert steps[0].status is OdometryStatus.FIRST
         assert steps[0].prev_from_curr is None

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.builders import forward, make_edge
 from tests.reference import recall as reference
-from tests.worlds import forward, make_edge
 
 from engram import _core
 from engram.graph.basin import prior_basin_m

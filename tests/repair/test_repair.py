@@ -4,8 +4,8 @@ import shutil
 
 import numpy as np
 import pytest
+from tests.builders import covariance_of, forward, make_edge
 from tests.fleet.robots import merged, robot_map
-from tests.worlds import covariance_of, forward, make_edge
 
 from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions

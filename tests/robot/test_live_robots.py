@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import session_for
-from tests.synthetic_world import Seen, World, drive
+from tests.builders import Seen, World, drive, session_for
 
 from engram.doctor.examination import DoctorConfig
 from engram.errors import ConfigError, MapError, MapLockedError, StorageFullError

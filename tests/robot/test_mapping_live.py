@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from tests.builders import write_street
 from tests.goldens import through
 from tests.goldens.cases import DRIVE_0001, HAMLET, KITTI_06, ROOM, DrivesMissingError, data
 
@@ -18,7 +19,7 @@ from engram.robot.starting import robot_in
 
 
 def street(folder: Path) -> Iterator[DriveSequence]:
-    yield through.drive(through.write_street(folder / "street"))
+    yield through.drive(write_street(folder / "street", frames=12))
 
 
 def kitti(_: Path) -> Iterator[DriveSequence]:

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lab.tests.evaluation.campaigns import write_campaign
-from tests.mapping_rig import localise_simulated, map_simulated
-from tests.synthetic_world import World, drive
+from tests.builders import World, drive, localise_simulated, map_simulated
 
 from engram.errors import IncompatibleError, InputError
 from engram.frontend.frame import BRIEF, TEBLID

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.mapping_rig import map_simulated
-from tests.synthetic_world import World, drive
+from tests.builders import TOWN, TOWN_ROAD, World, drive
 
 from engram.errors import EngramError, InputError, MapCorruptError
 from engram.localiser.localisation import LocalisationStatus
@@ -23,17 +22,9 @@ from engram.sequences.framelog.reader import FrameLog
 from engram.sequences.opening import open_drive
 from engram_lab.bench.data import synthetic_drive
 
-ROAD = np.arange(0.0, 20.0, 0.7)
-WORLD = World(30.0)
-LIVE = drive(WORLD, ROAD + 0.2, seed=3, start_ns=10**15)
+ROAD = TOWN_ROAD[:29]
+LIVE = drive(TOWN, ROAD + 0.2, seed=3, start_ns=10**15)
 ELSEWHERE = drive(World(30.0, seed=9), ROAD + 0.2, seed=4, start_ns=10**15 + 4 * 10**9)
-
-
-@pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("recorder") / "town.engram"
-    map_simulated(path, drive(WORLD, ROAD))
-    return path
 
 
 def test_a_lost_robot_writes_what_led_to_it_and_the_file_is_a_drive(

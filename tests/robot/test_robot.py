@@ -11,8 +11,7 @@ from types import FrameType
 
 import numpy as np
 import pytest
-from tests.mapping_rig import map_simulated
-from tests.synthetic_world import World, drive
+from tests.builders import TOWN, TOWN_ROAD, drive
 
 import engram
 from engram import _core
@@ -37,15 +36,7 @@ from engram.robot.starting import robot_on
 from engram.sequences.opening import open_drive
 from engram.sequences.sequence import LoggedFrame
 
-ROAD = np.arange(0.0, 20.0, 0.7)
 PACKAGE = str(Path(engram.__file__).parent)
-
-
-@pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("robot") / "town.engram"
-    map_simulated(path, drive(World(30.0), ROAD))
-    return path
 
 
 @pytest.fixture
@@ -59,7 +50,7 @@ def localiser(town: Path) -> Iterator[Localiser]:
             yield made
 
 
-LIVE = drive(World(30.0), ROAD, seed=1, start_ns=10**15)
+LIVE = drive(TOWN, TOWN_ROAD, seed=1, start_ns=10**15)
 
 
 def frames_of_the_package() -> list[str]:

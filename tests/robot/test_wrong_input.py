@@ -12,8 +12,7 @@ from uuid import uuid4
 
 import numpy as np
 import pytest
-from tests.mapping_rig import map_simulated
-from tests.synthetic_world import World, drive
+from tests.builders import TOWN, TOWN_ROAD, drive
 
 from engram.errors import ConfigError, IncompatibleError, InputError, SequenceError
 from engram.frontend.frame import StereoPair
@@ -26,25 +25,22 @@ from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.robot.mapping import map_drive
 from engram.robot.robot import Robot
 
-ROAD = np.arange(0.0, 20.0, 0.7)
-LIVE = drive(World(30.0), ROAD, seed=1, start_ns=10**15)
+LIVE = drive(TOWN, TOWN_ROAD, seed=1, start_ns=10**15)
 CAMERA = LIVE[0].frame.camera
 GREY = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
 LATER_NS = 10**18
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Map]:
-    path = tmp_path_factory.mktemp("robot") / "town.engram"
-    map_simulated(path, drive(World(30.0), ROAD))
-    with open_map(path) as opened:
+def opened(town: Path) -> Iterator[Map]:
+    with open_map(town) as opened:
         yield opened
 
 
 @pytest.fixture
-def robot(town: Map) -> Iterator[Robot]:
-    with town.robot(CAMERA, relocaliser=None) as made:
-        made.place_at(Position.at(town.graph.node(0).id))
+def robot(opened: Map) -> Iterator[Robot]:
+    with opened.robot(CAMERA, relocaliser=None) as made:
+        made.place_at(Position.at(opened.graph.node(0).id))
         assert made.step(LIVE[0].logged).localised
         yield made
 
@@ -119,8 +115,8 @@ def test_a_motion_that_nothing_tells_is_taken(robot: Robot) -> None:
     assert robot.step(LIVE[1].logged, motion=unknown).motion is unknown
 
 
-def test_a_robot_is_placed_only_where_the_map_has_a_node(robot: Robot, town: Map) -> None:
-    node = town.graph.node(0).id
+def test_a_robot_is_placed_only_where_the_map_has_a_node(robot: Robot, opened: Map) -> None:
+    node = opened.graph.node(0).id
     for wrong in (
         None,
         np.eye(4),
@@ -133,8 +129,8 @@ def test_a_robot_is_placed_only_where_the_map_has_a_node(robot: Robot, town: Map
     assert robot.step(LIVE[1].logged).localised
 
 
-def test_a_closed_robot_says_so(town: Map) -> None:
-    with town.robot(CAMERA) as robot:
+def test_a_closed_robot_says_so(opened: Map) -> None:
+    with opened.robot(CAMERA) as robot:
         robot.step(LIVE[0].logged)
     with pytest.raises(InputError, match=r"closed; make another one with Map\.robot"):
         robot.step(LIVE[1].logged)
@@ -151,9 +147,9 @@ def test_a_closed_robot_says_so(town: Map) -> None:
         (CAMERA, {"threads": 5.5}, ConfigError),
     ],
 )
-def test_what_makes_no_robot_is_named(town: Map, camera, options, kind) -> None:
+def test_what_makes_no_robot_is_named(opened: Map, camera, options, kind) -> None:
     with pytest.raises(kind, match=next(iter(options), "camera")):
-        town.robot(camera, **options)
+        opened.robot(camera, **options)
 
 
 def test_another_thread_may_ask_for_poses_during_a_step(robot: Robot) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from tests.synthetic_world import World, drive
+from tests.builders import World, drive
 
 from engram.graph.model import Clock
 from engram.robot.settings import RobotOptions

@@ -5,7 +5,7 @@ from uuid import UUID
 
 import numpy as np
 import pytest
-from tests.synthetic_world import World, drive
+from tests.builders import World, drive
 
 from engram.frontend.matching import MatcherConfig
 from engram.graph.model import NodeId, SessionId, node_id

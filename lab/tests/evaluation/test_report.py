@@ -9,7 +9,7 @@ from uuid import UUID
 
 import numpy as np
 import pytest
-from tests.synthetic_world import CAMERA
+from tests.builders import CAMERA
 
 from engram.errors import InputError
 from engram.frontend.frame import BRIEF

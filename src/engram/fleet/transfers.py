@@ -24,7 +24,7 @@ from typing import Annotated, Any, NewType, TypeAlias
 import msgspec
 from sqlalchemy import Table
 
-from engram.errors import InputError, MapCorruptError, MapError, MissingExtraError
+from engram.errors import InputError, MapCorruptError, MapError, extra
 from engram.maps.exchange import EXCHANGED, MapRows, Values, map_of_rows
 from engram.maps.map import Map
 from engram.maps.schema import frames, vocabularies
@@ -485,10 +485,6 @@ class Signer:
 
 def _ed25519() -> Any:
     """The module; the key pairs of robots alone need it."""
-    try:
+    with extra("agent", "keys of robots need cryptography"):
         from cryptography.hazmat.primitives.asymmetric import ed25519
-    except ImportError as error:
-        raise MissingExtraError(
-            "keys of robots need cryptography: pip install 'engram-localisation[agent]'"
-        ) from error
     return ed25519

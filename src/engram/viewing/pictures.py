@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from engram.counts import counted
 from engram.doctor.examination import align
-from engram.errors import InputError, MissingExtraError
+from engram.errors import InputError, extra
 from engram.files import check_output
 from engram.frontend.features import match_sides
 from engram.frontend.frame import Frame, StereoPair
@@ -33,13 +33,9 @@ from engram.untrusted import printable
 
 def matplotlib_for_files() -> ModuleType:
     """Matplotlib without a window."""
-    try:
+    with extra("plots", "pictures need Matplotlib"):
         import matplotlib
         import matplotlib.figure
-    except ImportError as error:
-        raise MissingExtraError(
-            "pictures need Matplotlib: pip install 'engram-localisation[plots]'"
-        ) from error
     matplotlib.use("Agg")
     return matplotlib
 

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.errors import InputError, MissingExtraError
+from engram.errors import InputError, extra
 from engram.frontend.frame import StereoPair
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import SessionId
@@ -157,13 +157,8 @@ def viewer_on(view: Path) -> Viewer:
 
 
 def _rerun() -> Any:
-    try:
+    with extra("view", "the viewer needs Rerun (engram plot and localise --pictures do not)"):
         import rerun
-    except ImportError as error:
-        raise MissingExtraError(
-            "the viewer needs Rerun: pip install 'engram-localisation[view]'; without it, use "
-            "engram plot and engram localise --pictures"
-        ) from error
     return rerun
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from engram.errors import EngramError, InputError, MissingExtraError, storage_full
+from engram.errors import EngramError, InputError, extra, storage_full
 from engram.fleet.agent.agent_state import AgentState
 from engram.fleet.transfers import PartHash, Signer, Unbundler, bundle, enrolment_text, token_text
 from engram.monitor import write_whole
@@ -40,12 +40,8 @@ def new_client(url: str, **options: Any) -> httpx.Client:
     Raises:
         MissingExtraError: httpx is not installed.
     """
-    try:
+    with extra("agent", "the agent needs httpx"):
         import httpx
-    except ImportError as error:
-        raise MissingExtraError(
-            "the agent needs httpx: pip install 'engram-localisation[agent]'"
-        ) from error
     return httpx.Client(base_url=url, timeout=30.0, **options)
 
 

@@ -6,11 +6,12 @@ import asyncio
 import queue
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 from uuid import uuid4
 
-from engram.errors import EngramError, MissingExtraError, WorkerError
+from engram.errors import EngramError, WorkerError, extra
 from engram.fleet.build.scratch import GroupResult, GroupTask, keeping, map_group_far_away
 from engram.monitor import Monitor, write_whole
 from engram.processes import LISTEN_S, MAX_RETRIES, WordsTogether
@@ -100,11 +101,9 @@ def check_scheduler(scheduler: str) -> None:
 
     Without a Dask client: one that fails to connect takes half a minute to close.
     """
-    try:
+    with _dask():
         from distributed import Security
         from distributed.comm import connect
-    except ImportError as error:
-        raise _missing() from error
 
     async def greet() -> None:
         ways = Security().get_connection_args("client")
@@ -126,10 +125,8 @@ def check_scheduler(scheduler: str) -> None:
 
 def _connected(scheduler: str) -> Client:
     """A client of its own, not registered as Dask's default."""
-    try:
+    with _dask():
         from distributed import Client
-    except ImportError as error:
-        raise _missing() from error
     check_scheduler(scheduler)
     try:
         return Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
@@ -137,10 +134,8 @@ def _connected(scheduler: str) -> Client:
         raise _silent(scheduler, error) from error
 
 
-def _missing() -> MissingExtraError:
-    return MissingExtraError(
-        "work on a cluster needs Dask: pip install 'engram-localisation[cluster]'"
-    )
+def _dask() -> AbstractContextManager[None]:
+    return extra("cluster", "work on a cluster needs Dask")
 
 
 def _silent(scheduler: str, error: Exception) -> WorkerError:

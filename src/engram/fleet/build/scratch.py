@@ -18,8 +18,8 @@ from engram.errors import (
     ConfigError,
     MapError,
     MapLockedError,
-    MissingExtraError,
     SequenceError,
+    extra,
     storage_full,
 )
 from engram.files import WriterLock, current_holder
@@ -106,12 +106,8 @@ def fetched(source: str) -> Iterator[Path]:
     if "://" not in source:
         yield Path(source)
         return
-    try:
+    with extra("cluster", f"{source}: drives at URLs need fsspec"):
         import fsspec
-    except ImportError as error:
-        raise MissingExtraError(
-            f"{source}: drives at URLs need fsspec: pip install 'engram-localisation[cluster]'"
-        ) from error
     with tempfile.TemporaryDirectory(prefix="engram-drive-") as folder:
         copy = Path(folder) / source.rstrip("/").rsplit("/", 1)[-1]
         try:

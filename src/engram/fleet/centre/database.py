@@ -35,7 +35,7 @@ from sqlalchemy.dialects.sqlite import insert as insert_sqlite
 from sqlalchemy.exc import ArgumentError, DataError, DBAPIError
 
 from engram import PRE_RELEASE, __version__
-from engram.errors import FormatVersionError, InputError, MissingExtraError, StorageFullError
+from engram.errors import FormatVersionError, InputError, StorageFullError, extra
 from engram.fleet.centre.problems import StoreError
 from engram.fleet.centre.tables import (
     TABLES,
@@ -241,13 +241,10 @@ class _SharedSync:
 
 def _engine(url: str | URL) -> Engine:
     try:
-        engine = create_engine(url, pool_size=8, max_overflow=-1)
+        with extra("server", "a centre on PostgreSQL needs its driver"):
+            engine = create_engine(url, pool_size=8, max_overflow=-1)
     except ArgumentError as error:
         raise InputError(f"not a valid database address: {error}") from error
-    except ImportError as error:
-        raise MissingExtraError(
-            "a centre on PostgreSQL needs its driver: pip install 'engram-localisation[server]'"
-        ) from error
     if engine.dialect.name == "sqlite":
 
         @event.listens_for(engine, "connect")

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from sqlalchemy import Connection, delete, select
 
-from engram.errors import MapError, MissingExtraError, storage_full
+from engram.errors import MapError, extra, storage_full
 from engram.fleet.centre.database import ServiceDatabase, rows_of
 from engram.fleet.centre.problems import StoreError
 from engram.fleet.centre.tables import GivenPart, Pack, PackedPart, given, packs, parts
@@ -124,12 +124,8 @@ class BucketObjects:
     """Objects in a bucket that speaks S3, or wherever else obstore reaches."""
 
     def __init__(self, url: str) -> None:
-        try:
+        with extra("centre", "objects in a bucket need obstore"):
             from obstore.store import from_url
-        except ImportError as error:
-            raise MissingExtraError(
-                "objects in a bucket need obstore: pip install 'engram-localisation[centre]'"
-            ) from error
         self._store = from_url(url)
 
     @contextmanager

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from engram.errors import ConfigError, InputError, MapError, MissingExtraError, StorageFullError
+from engram.errors import ConfigError, InputError, MapError, StorageFullError, extra
 from engram.files import draft_folder
 from engram.fleet.centre.database import WorkListener
 from engram.fleet.centre.objects import FolderObjects, sync_folder
@@ -69,14 +69,10 @@ def serve(centre: Centre, listening: Listening, *, worker: bool = True) -> None:
         MissingExtraError: the extra `centre` is not installed.
         InputError: it cannot listen there, or not with this certificate and key.
     """
-    try:
+    with extra("centre", "the centre needs its extra"):
         import uvicorn
 
         from engram.fleet.centre.application import create_app
-    except ImportError as error:
-        raise MissingExtraError(
-            "the centre needs its extra: pip install 'engram-localisation[centre]'"
-        ) from error
     config = uvicorn.Config(
         create_app(centre),
         listening.host,
