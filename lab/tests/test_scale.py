@@ -6,7 +6,7 @@ from pathlib import Path
 
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
-from engram_lab.studies.scale import City, Figures, drive_in, table
+from engram_lab.studies.scale import City, Figures, ask, drive_in, table, write_in
 
 
 def test_a_city_is_a_sound_map_that_localises(tmp_path: Path) -> None:
@@ -21,6 +21,10 @@ def test_a_city_is_a_sound_map_that_localises(tmp_path: Path) -> None:
         assert city.node(1, 2, 20).id in {node.id for node in opened.load().nodes}
     figures = drive_in(path, city)
     assert figures["localised (%)"] > 90
+    before = path.read_bytes()
+    assert all(seconds >= 0 for seconds in write_in(path, city).values())
+    assert set(ask(path, city)) == {"info (s)", "log (s)", "show NODE (s)"}
+    assert path.read_bytes() == before
 
 
 def test_the_table_has_a_column_a_city() -> None:

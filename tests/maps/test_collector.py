@@ -4,7 +4,7 @@ import gc
 
 import pytest
 
-from engram.maps.map_reader import no_collections
+from engram.maps.map import no_collections
 
 
 @pytest.mark.parametrize("was_on", [True, False])

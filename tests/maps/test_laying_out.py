@@ -11,7 +11,7 @@ import pytest
 from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind
 from engram.graph.placing import MAP_FROM_CAMERA
-from engram.maps import map_writer
+from engram.maps import map as map_module
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.maps.map_frame import all_places
@@ -64,7 +64,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
 @pytest.fixture
 def town(location: Path, calls: list[bool], monkeypatch: pytest.MonkeyPatch) -> Iterator[Town]:
     with Map.create(location) as store:
-        own_places = map_writer.new_places
+        own_places = map_module.new_places
 
         def compared(connection, view, contents, own, config):
             found = own_places(connection, view, contents, own, config)
@@ -78,7 +78,7 @@ def town(location: Path, calls: list[bool], monkeypatch: pytest.MonkeyPatch) -> 
                     )
             return found
 
-        monkeypatch.setattr(map_writer, "new_places", compared)
+        monkeypatch.setattr(map_module, "new_places", compared)
         yield Town(store)
     assert check_file(location).problems == ()
 

@@ -18,7 +18,7 @@ from engram.graph.placing import DEFAULT_CONFIG as PLACING
 from engram.graph.placing import PlacingConfig, Poses, place, replace_after_removal
 
 if TYPE_CHECKING:
-    from engram.maps.map_reader import MapReader
+    from engram.maps.map import Map
 
 
 # Metres per degree of latitude, and the least movement that is worth a word.
@@ -303,12 +303,12 @@ def _about_vertical(yaw_rad: float) -> NDArray[np.float64]:
 ORIGIN = "map_frame"
 
 
-def frame_of(store: MapReader, revision: int, nodes: int) -> MapFrame:
-    """The map frame of an opened map; `MapReader.frame` shares it.
+def frame_of(store: Map, revision: int, nodes: int) -> MapFrame:
+    """The map frame of an opened map; `Map.frame` shares it.
 
     Args:
         store: the map.
-        revision, nodes: of the map, for `MapReader.derived`: the frame changes with them.
+        revision, nodes: of the map, for `Map.derived`: the frame changes with them.
     """
     del revision, nodes
     graph = store.graph
@@ -317,9 +317,7 @@ def frame_of(store: MapReader, revision: int, nodes: int) -> MapFrame:
     return MapFrame(graph, place(graph, store.placements), known)
 
 
-def all_places(
-    store: MapReader, contents: Mapping[str, float], config: PlacingConfig
-) -> list[Placement]:
+def all_places(store: Map, contents: Mapping[str, float], config: PlacingConfig) -> list[Placement]:
     """The places that an open revision has to write, by a layout of the whole map.
 
     Args:

@@ -206,7 +206,11 @@ def load_statistics(connection: Connection, view: View) -> dict[str, dict[str, A
 
 
 def load_vocabulary(connection: Connection, view: View) -> bytes | None:
-    """The newest vocabulary; None if there is none."""
+    """The newest vocabulary, encoded; None if there is none.
+
+    Raises:
+        MapCorruptError: it does not match its hash.
+    """
     kept = list(view.rows(connection, vocabularies))
     if not kept:
         return None

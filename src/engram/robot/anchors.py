@@ -34,7 +34,6 @@ from engram.localiser.relocalisation import Relocaliser, Suggested
 from engram.mapper.loops import edges_agree
 from engram.maps.map import Map
 from engram.maps.map_frame import FARTHEST_M, ORIGIN, MapFrame, Moves, changed, local_m, moves
-from engram.maps.map_reader import MapReader
 from engram.monitor import QUIET, Monitor
 from engram.robot.localisers import DriveSequence, relocaliser_in
 from engram.robot.settings import Settings
@@ -613,7 +612,7 @@ def remove_goal(path: Path, name: str, *, author: str) -> dict[str, Any]:
             return {"name": name, "revision": writer.commit().number}
 
 
-def had_goal(store: MapReader, goal: Goal) -> bool:
+def had_goal(store: Map, goal: Goal) -> bool:
     """Whether a map ever had a goal of this name at this place, at nodes that it has."""
     graph = store.graph
     for one in store.seen_goals:
@@ -633,7 +632,7 @@ def list_goals(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
         return [_described(goal, store) for _, goal in sorted(store.goals.items())]
 
 
-def _described(goal: Goal, store: MapReader) -> dict[str, Any]:
+def _described(goal: Goal, store: Map) -> dict[str, Any]:
     """Name, node and place of a goal."""
     return {
         "name": goal.name,

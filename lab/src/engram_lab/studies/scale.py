@@ -15,6 +15,7 @@ the vocabulary. Times are of the processor.
 from __future__ import annotations
 
 import multiprocessing
+import shutil
 import sqlite3
 import time
 import zlib
@@ -23,6 +24,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -33,18 +35,20 @@ from engram import __version__
 from engram.frontend.blobs import blob_hash, decode_landmarks
 from engram.frontend.frame import Frame, FrameStatus
 from engram.geometry.se3 import SE3
-from engram.graph.model import EdgeKind, Node, PathEntryKind, Session, path_id
+from engram.graph.model import Edge, EdgeKind, Node, PathEntryKind, Session, path_id
 from engram.graph.paths import Attempts
 from engram.graph.placing import MAP_FROM_CAMERA
 from engram.localiser.localisation import Position
 from engram.maps import schema
 from engram.maps.attempts import encode_words, pack
+from engram.maps.history import blame_node, map_log
 from engram.maps.map import Map
 from engram.maps.rows import camera_row, covariance_bytes, session_row, to_json, transform_bytes
 from engram.maps.sqlite import SqliteDatabase
 from engram.maps.upgrading import complete_history
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.places.vocabulary import Vocabulary, default_vocabulary, hash_of
+from engram.robot.inspecting import describe_map
 from engram.sequences.sequence import LoggedFrame
 from engram_lab.synthetic_places import (
     CAMERA,
@@ -53,6 +57,7 @@ from engram_lab.synthetic_places import (
     drive_of,
     landmark_bytes,
     node_of,
+    stored,
 )
 
 LANES = 5
@@ -372,7 +377,69 @@ def drive_in(path: Path, city: City) -> dict[str, float]:
         }
 
 
-MEASURES: Mapping[str, Callable[[Path, City], dict[str, float]]] = {"robot": drive_in}
+def write_in(path: Path, city: City) -> dict[str, float]:
+    """Writes drives of 50 nodes and of one to a copy of the map, next to the driven street."""
+    found: dict[str, float] = {}
+    with TemporaryDirectory(dir=path.parent) as folder:
+        shutil.copy(path, copied := Path(folder) / path.name)
+        with Map.open(copied, writes=True) as opened:
+            _write_drive(opened, city, 0, 2)  # what is loaded and compiled once is not counted
+            for number, count in enumerate((50, 1), start=1):
+                taken = _write_drive(opened, city, number, count)
+                for name, seconds in zip(("begin", "checkpoint", "commit"), taken, strict=True):
+                    found[f"{name}, {count} nodes (s)"] = seconds
+    return found
+
+
+def _write_drive(opened: Map, city: City, number: int, count: int) -> list[float]:
+    """A drive past the nodes of a lane; seconds that its begin, checkpoint and commit take."""
+    made = drive_of("late", 2 * _FIRST_NS + number * 3_600_000_000_000, str(number))
+    nodes = [node_of(made, made.start_ns + at * _PERIOD_NS, float(at)) for at in range(count)]
+    blob = landmark_bytes(np.random.default_rng(number), None, LANDMARKS)
+    marks = [time.process_time()]
+    writer = opened.begin_session(
+        made, CAMERA, descriptor=DESCRIPTOR, frontend=FRONTEND, author="scale", configuration={}
+    )
+    marks.append(time.process_time())
+    step = SE3.exp(np.array([0.0, 0.0, 1.0, 0.0, 0.01, 0.0]))
+    beside = SE3.exp(np.array([0.5, 0.0, 0.1, 0.0, 0.0, 0.0]))
+    for at, node in enumerate(nodes):
+        writer.copy_node(stored(node, blob))
+        if at:
+            writer.add_edge(Edge(nodes[at - 1].id, node.id, EdgeKind.ODOMETRY, step, _STEP_SIGMA))
+        if at % 5 == 0:
+            other = city.node(city.driven, 2, at % city.length)
+            writer.add_edge(Edge(other.id, node.id, EdgeKind.MATCH, beside, _MATCH_SIGMA))
+    filled = time.process_time()
+    writer.checkpoint()
+    marks.append(marks[-1] + time.process_time() - filled)
+    checked = time.process_time()
+    writer.commit()
+    marks.append(marks[-1] + time.process_time() - checked)
+    return np.diff(marks).tolist()
+
+
+def ask(path: Path, city: City) -> dict[str, float]:
+    """What people ask of a map: seconds that each question takes."""
+    node = str(city.node(city.driven, 1, 10).id)
+    questions: Mapping[str, Callable[[], object]] = {
+        "info": lambda: describe_map(path),
+        "log": lambda: map_log(path),
+        "show NODE": lambda: blame_node(path, node),
+    }
+    found = {}
+    for name, question in questions.items():
+        begun = time.process_time()
+        question()
+        found[f"{name} (s)"] = time.process_time() - begun
+    return found
+
+
+MEASURES: Mapping[str, Callable[[Path, City], dict[str, float]]] = {
+    "robot": drive_in,
+    "writing": write_in,
+    "questions": ask,
+}
 
 
 def resident_mb() -> float:

@@ -24,7 +24,6 @@ from engram.fleet.centre.problems import UnknownError
 from engram.fleet.centre.tables import JobState, MapListed, artifacts, handins, maps, refs
 from engram.fleet.merge.merge_settings import MergeOptions
 from engram.maps.map import Map
-from engram.maps.map_reader import MapReader
 from engram.maps.records import Revision
 
 
@@ -83,12 +82,12 @@ class OpenMaps:
         return held
 
 
-def log_of(store: MapReader) -> tuple[Revision, ...]:
+def log_of(store: Map) -> tuple[Revision, ...]:
     """Its revisions, oldest first, read once."""
     return store.derived(_log)
 
 
-def _log(store: MapReader) -> tuple[Revision, ...]:
+def _log(store: Map) -> tuple[Revision, ...]:
     return tuple(store.log())
 
 
