@@ -175,11 +175,11 @@ def explain_frame(
     ):
         for number, arrived in enumerate(frames):
             watching.watches = number == options.frame
-            found = robot.step(arrived)
+            result = robot.step(arrived)
             if number == options.frame:
                 assert robot.last is not None
                 attempted = {outcome.candidate.index for outcome in robot.last.outcomes}
-                return _explained(opened, options, found, watching, attempted)
+                return _explained(opened, options, result, watching, attempted)
     raise ConfigError(f"the drive has no frame {options.frame}; it has {len(sequence)}")
 
 

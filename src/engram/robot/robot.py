@@ -212,29 +212,29 @@ class Robot:
             deadline = None if deadline_ms is None else clock.started + deadline_ms / 1e3
             self._localiser.move(motion)
             try:
-                found = self._known(frame, motion)
-                if found is None:
-                    found = self._localiser.localise(frame, deadline, self._result_sink, clock)
-                for earlier in self.track if found.withdraws else ():
-                    if earlier.stamp_ns in found.withdraws:
+                result = self._known(frame, motion)
+                if result is None:
+                    result = self._localiser.localise(frame, deadline, self._result_sink, clock)
+                for earlier in self.track if result.withdraws else ():
+                    if earlier.stamp_ns in result.withdraws:
                         self._withdraw(earlier)
-                found = self._kept(frame, found)
+                result = self._kept(frame, result)
             except MapError:
                 self._followed(arrived, motion)
                 raise
             if deadline is not None and time.perf_counter() > deadline:
-                found = replace(found, late=True)
+                result = replace(result, late=True)
             if self._front.fixed_share:
-                found = replace(found, fixed_share=self._front.fixed_share)
+                result = replace(result, fixed_share=self._front.fixed_share)
             self._front.match_again(frame, self._localiser.best_matched)
             self.last = LastFrame(arrived, frame, self._localiser.outcomes)
             if self.watch is not None:
-                self.watch(self.last, found)
+                self.watch(self.last, result)
             if self.recorder is not None:
-                self.recorder.note(arrived, frame, found, self._localiser.outcomes)
-            self.track = (*self.track[1 - _REMEMBERED :], found)
+                self.recorder.note(arrived, frame, result, self._localiser.outcomes)
+            self.track = (*self.track[1 - _REMEMBERED :], result)
         raise_if_asked()
-        return self._with_stamps(found, stamp_of(given))
+        return self._with_stamps(result, stamp_of(given))
 
     localise = step
 
@@ -275,11 +275,11 @@ class Robot:
                 motion = None
                 if outside is not None and self._time_ns is not None:
                     motion = outside.between(self._time_ns, stamp_of(arrived))
-                found = self.step(arrived, motion=motion, arrived_s=due, trusted=True)
+                result = self.step(arrived, motion=motion, arrived_s=due, trusted=True)
                 if rate_hz is not None and self._deadline_ms is None:
-                    found = replace(found, late=time.perf_counter() > due + 1 / rate_hz)
-                yield found
-                monitor.advance(_word(found))
+                    result = replace(result, late=time.perf_counter() > due + 1 / rate_hz)
+                yield result
+                monitor.advance(_word(result))
                 monitor.check()
                 raise_if_asked()
 
@@ -525,14 +525,14 @@ class DisplayPose:
         """
         position = result.position
         map_from_node = None if position is None else self._found(position.node)
-        here = None
+        map_from_live = None
         if position is not None and map_from_node is not None:
-            here = map_from_node @ position.node_from_live
+            map_from_live = map_from_node @ position.node_from_live
         elif result.saved is not None and not self._saved and not len(self._frame.positions):
-            here = SE3(MAP_FROM_CAMERA.copy(), np.zeros(3))
-        if result.saved is not None and here is not None:
-            self._saved[result.saved] = here
-        return here
+            map_from_live = SE3(MAP_FROM_CAMERA.copy(), np.zeros(3))
+        if result.saved is not None and map_from_live is not None:
+            self._saved[result.saved] = map_from_live
+        return map_from_live
 
     def _found(self, node: NodeId) -> SE3 | None:
         """The place of a node, if need be along the graph from the last one that had a place."""
@@ -550,8 +550,8 @@ class DisplayPose:
             return None
         self._asked = asked
         map_from_placed = self.of(placed)
-        way = graph.predict(graph.index(placed), graph.index(node))
-        if way is None or map_from_placed is None:
+        predicted = graph.predict(graph.index(placed), graph.index(node))
+        if predicted is None or map_from_placed is None:
             return None
-        self._saved[node] = map_from_placed @ way[0]
+        self._saved[node] = map_from_placed @ predicted[0]
         return self._saved[node]

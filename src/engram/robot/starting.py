@@ -159,9 +159,9 @@ def localise_drive(
     """Localises a whole drive in an unchanged map; one result per frame."""
     with (
         robot_on(opened, sequence, settings or Settings(), options) as robot,
-        closing(robot.drive(sequence, monitor)) as found,
+        closing(robot.drive(sequence, monitor)) as results,
     ):
-        return list(found)
+        return list(results)
 
 
 def measure(
