@@ -144,7 +144,7 @@ def open_drive(path: str | Path, **given: Any) -> Drive:
     """Opens a drive of any known layout. Folders are checked for all images; none is decoded.
 
     Image layouts give an `ImageSequence`, bags a `BagSequence` (both are a `StereoSequence`), frame
-    logs a `FrameLog` (a `FrameSequence`).
+    logs a `FrameLog`.
 
     Args:
         path: folder or file of the drive: stereo images, a ROS bag, or a frame log.

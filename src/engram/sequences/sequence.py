@@ -1,4 +1,4 @@
-"""The two protocols of all data sources, and options for opening a drive."""
+"""Stereo sequences, frames with odometry, and options for opening a drive."""
 
 from __future__ import annotations
 
@@ -83,24 +83,6 @@ class LoggedFrame:
 
     frame: Frame
     odometry: OdometryStep
-
-
-class FrameSequence(Protocol):
-    """A drive as frames with odometry: a frame log, or a stereo sequence run through both."""
-
-    @property
-    def info(self) -> SequenceInfo:
-        """Facts about the drive as a whole."""
-        ...
-
-    @property
-    def camera(self) -> StereoCamera:
-        """The one camera of the drive."""
-        ...
-
-    def __len__(self) -> int: ...
-
-    def __iter__(self) -> Iterator[LoggedFrame]: ...
 
 
 def first_pair_hash(pair: StereoPair) -> str:

@@ -62,7 +62,7 @@ def open_framelog(path: Path, options: OpenOptions) -> FrameLog:
 
 
 class FrameLog:
-    """A `FrameSequence` over a frame log. Frames are decoded on demand.
+    """A frame log as a drive of frames with odometry, decoded on demand.
 
     With a range of frames, odometry is composed over the frames left out; if one of those steps
     failed, the composed step fails too. With `skip_bad`, damaged frames are left out, too, and
