@@ -16,6 +16,7 @@
 #include <system_error>
 #include <thread>
 
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/pair.h>
 
 #include "bindings/arrays.hpp"
@@ -254,6 +255,7 @@ struct RenderCamera {
   float fx, fy, cx, cy;
   int32_t width, height;
   float baseline_m;
+  std::array<float, 3> turn; // of the right camera against the left one, small, radians
 };
 
 class Scene {
@@ -443,8 +445,14 @@ View Scene::view_of(const RenderCamera &camera, const double *rotation, const do
                     int samples) const {
   View view = {};
   std::copy_n(rotation, 9, view.rotation);
-  for (int k = 0; k < 3; ++k)
+  for (int k = 0; k < 3; ++k) {
     view.centre[k] = centre[k] + eye * camera.baseline_m * rotation[3 * k];
+    const double *row = rotation + 3 * k;
+    const double turn[3] = {eye * camera.turn[0], eye * camera.turn[1], eye * camera.turn[2]};
+    for (int i = 0; i < 3; ++i)
+      view.rotation[3 * k + i] +=
+          row[(i + 1) % 3] * turn[(i + 2) % 3] - row[(i + 2) % 3] * turn[(i + 1) % 3];
+  }
   view.fx = camera.fx, view.fy = camera.fy, view.cx = camera.cx, view.cy = camera.cy;
   view.width = camera.width, view.height = camera.height, view.samples = samples;
   return view;
@@ -623,7 +631,8 @@ void Scene::build_lamp(StoredLamp &lamp) {
                          0.5f * kLampFace - 0.5f,
                          kLampFace,
                          kLampFace,
-                         0};
+                         0,
+                         {}};
   const double centre[3] = {lamp.position[0], lamp.position[1], lamp.position[2]};
   const auto order = order_from(centre, lamp.range, 1, static_cast<int>(meshes_.size()));
   lamp.depth.resize(5ULL * kLampFace * kLampFace);
@@ -723,6 +732,16 @@ auto Scene::render(const RenderCamera &camera, const Input<double, 2> &rotation,
           inverse_depth[eye * pixels + static_cast<size_t>(y) * camera.width + x] =
               depths[(static_cast<size_t>(y) * camera.width * kSamples + x) * kSamples];
     });
+    if (light.wet > 0 && light.mirrors > 0) {
+      const std::vector<float> shown = luminance;
+      parallel(threads, 2 * bands, [&](int task) {
+        const int eye = task % 2, band = task / 2;
+        const View view = view_of(camera, r, centre.data(), eye, kSamples);
+        ENGRAM_CALL(mirror_view, world, light, view, inverse_depth.data() + eye * pixels,
+                    shown.data() + eye * pixels, camera.height * band / bands,
+                    camera.height * (band + 1) / bands, luminance.data() + eye * pixels);
+      });
+    }
   }
   const std::initializer_list<size_t> shape = {2, static_cast<size_t>(camera.height),
                                                static_cast<size_t>(camera.width)};
@@ -776,7 +795,8 @@ void check_pose(const RenderCamera &camera, const Input<double, 2> &rotation,
   if (!(camera.fx > 0 && camera.fy > 0) || camera.width < 1 || camera.height < 1 ||
       camera.width > 4096 || camera.height > 4096)
     throw nb::value_error("camera: focal lengths must be > 0 and sides 1 to 4096 px");
-  const float values[] = {camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m};
+  const float values[] = {camera.fx,         camera.fy,      camera.cx,      camera.cy,
+                          camera.baseline_m, camera.turn[0], camera.turn[1], camera.turn[2]};
   if (!all_finite(values, std::size(values)))
     throw nb::value_error("camera: must be finite");
 }
@@ -784,11 +804,12 @@ void check_pose(const RenderCamera &camera, const Input<double, 2> &rotation,
 Light make_light(const Input<float, 1> &sun, const Input<float, 2> &vehicle, float sun_power,
                  float sky_power, float cloud, float cloud_x, float cloud_y, float fog_per_m,
                  float haze, float wet, float snow, float headlights, float windows,
-                 float aureole) {
+                 float aureole, float mirrors) {
   if (sun.shape(0) != 3 || vehicle.shape(0) != 3 || vehicle.shape(1) != 3)
     throw nb::value_error("light: sun must have shape (3,) and vehicle (3, 3)");
   const float values[] = {sun_power, sky_power, cloud, cloud_x, cloud_y,    fog_per_m,
-                          haze,      wet,       snow,  headlights, windows,    aureole};
+                          haze,      wet,       snow,  headlights, windows,
+                          aureole,   mirrors};
   if (!all_finite(values, std::size(values)) || !all_finite(sun.data(), 3) ||
       !all_finite(vehicle.data(), 9))
     throw nb::value_error("light: must be finite");
@@ -799,6 +820,7 @@ Light make_light(const Input<float, 1> &sun, const Input<float, 2> &vehicle, flo
   light.cloud_shift[0] = cloud_x, light.cloud_shift[1] = cloud_y;
   light.fog_per_m = fog_per_m, light.haze = haze, light.wet = wet, light.snow = snow;
   light.headlights = headlights, light.windows = windows, light.aureole = aureole;
+  light.mirrors = mirrors;
   return light;
 }
 
@@ -837,13 +859,16 @@ NB_MODULE(_town, module) {
   nb::class_<Light>(module, "Light")
       .def_static("of", &make_light, "sun"_a, "vehicle"_a, "sun_power"_a, "sky_power"_a, "cloud"_a,
                   "cloud_x"_a, "cloud_y"_a, "fog_per_m"_a, "haze"_a, "wet"_a, "snow"_a,
-                  "headlights"_a, "windows"_a, "aureole"_a);
+                  "headlights"_a, "windows"_a, "aureole"_a, "mirrors"_a = 0.0f);
   nb::class_<RenderCamera>(module, "RenderCamera")
       .def(
           "__init__",
           [](RenderCamera *self, float fx, float fy, float cx, float cy, int32_t width, int32_t height,
-             float baseline_m) { new (self) RenderCamera{fx, fy, cx, cy, width, height, baseline_m}; },
-          "fx"_a, "fy"_a, "cx"_a, "cy"_a, "width"_a, "height"_a, "baseline_m"_a);
+             float baseline_m, const std::array<float, 3> &turn) {
+            new (self) RenderCamera{fx, fy, cx, cy, width, height, baseline_m, turn};
+          },
+          "fx"_a, "fy"_a, "cx"_a, "cy"_a, "width"_a, "height"_a, "baseline_m"_a,
+          "turn"_a = std::array<float, 3>{});
   nb::class_<Scene>(module, "Scene")
       .def(nb::init<const nb::ndarray<const uint8_t, nb::shape<256, 256>, nb::c_contig> &>(),
            "noise"_a)

@@ -107,6 +107,7 @@ struct Light {
   // Share of the sun's light that comes from the bright haze around it and from sunlit walls about:
   // it falls from the sun's side, so that relief shows in the shade too; shadows do not take it.
   float aureole;
+  float mirrors; // 1: wet ground mirrors what the picture shows; 0: a front of one brightness
   float vehicle[9]; // left and right headlight, and the direction they shine
 };
 

@@ -2,6 +2,10 @@
 
 #include <math.h>
 
+#include <algorithm>
+#include <cmath>
+
+
 #include <vector>
 
 #include "kernels/light_lanes.hpp"
@@ -103,7 +107,7 @@ Floats reflected_light(const Frame &frame, const Point &point, const Texels &tex
     return Floats{};
   const Floats mirrored = reflected(frame, point), share = mirror(point.cosine);
   return where(glass, texels.special * (0.03f + share) * mirrored) +
-         where(wet, point.wet * (share * mirrored + gloss));
+         where(wet, point.wet * ((1 - frame.light.mirrors) * share * mirrored + gloss));
 }
 
 Floats shade_point(const Frame &frame, const SurfaceLanes &surface, Point &point,
@@ -245,7 +249,95 @@ private:
   Sort sort_ = kSky;
 };
 
+// The scalar twins of noise_at, water_film and mirror.
+float noise_of(const int32_t *noise_quads, float x, float y) {
+  const float x_floor = floorf(x), y_floor = floorf(y);
+  const int32_t i = static_cast<int32_t>(x_floor) & 255, j = static_cast<int32_t>(y_floor) & 255;
+  const auto quad = static_cast<uint32_t>(noise_quads[j * 256 + i]);
+  const float a = x - x_floor, b = y - y_floor;
+  const auto byte = [&](int k) { return static_cast<float>(quad >> (8 * k) & 255); };
+  const float top = byte(0) + a * (byte(1) - byte(0)), bottom = byte(2) + a * (byte(3) - byte(2));
+  return (top + b * (bottom - top)) * (1 / 255.0f);
+}
+
+float film_of(const Surroundings &world, const Light &light, float x, float y) {
+  const float puddle = noise_of(world.noise_quads, 0.6f * x + 71, 0.6f * y + 13);
+  const float t = std::clamp((puddle - 0.5f) / 0.12f, 0.0f, 1.0f);
+  return light.wet * (0.25f + 0.75f * t * t * (3 - 2 * t));
+}
+
+float mirror_of(float cosine) {
+  const float c = 1 - std::clamp(cosine, 0.0f, 1.0f), c2 = c * c;
+  return 0.03f + 0.97f * c2 * c2 * c;
+}
+
+// Follows mirrored rays from the ground to what the picture shows there.
+struct Mirror {
+  const View &view;
+  const float *inverse_depths, *shown;
+
+  // The place of the picture, as an index, where a direction from a point (both in camera axes) ends:
+  // a guess is corrected by the depth that stands there, which settles where fronts are upright.
+  int64_t end_of(const float *from, const float *along) const {
+    float far = 15;
+    int64_t at = 0;
+    for (int step = 0; step < 4; ++step) {
+      float p[3];
+      for (int k = 0; k < 3; ++k)
+        p[k] = from[k] + far * along[k];
+      const float z = std::max(p[2], 0.2f);
+      const float u = std::clamp(view.cx + view.fx * p[0] / z, 0.0f, static_cast<float>(view.width - 1));
+      const float v = std::clamp(view.cy + view.fy * p[1] / z, 0.0f, static_cast<float>(view.height - 1));
+      at = static_cast<int64_t>(v + 0.5f) * view.width + static_cast<int64_t>(u + 0.5f);
+      const float stands = inverse_depths[at];
+      far = stands > 1e-3f ? (1 / stands - from[2]) / std::max(along[2], 0.05f) : 1000.0f;
+      far = std::clamp(far, 0.2f, 1000.0f);
+    }
+    return at;
+  }
+
+  // Water that is never quite level draws a point out in height.
+  float around(int64_t at) const {
+    const int64_t above = at - 2 * view.width, below = at + 2 * view.width;
+    const int64_t count = static_cast<int64_t>(view.width) * view.height;
+    return 0.5f * shown[at] + 0.25f * (shown[above < 0 ? at : above] + shown[below < count ? below : at]);
+  }
+};
+
 } // namespace
+
+void mirror_view(const Surroundings &world, const Light &light, const View &view,
+                 const float *inverse_depths, const float *shown, int32_t row_begin,
+                 int32_t row_end, float *luminance) {
+  constexpr double kLevel_m = 0.2; // ground and pavement
+  const Mirror mirror = {view, inverse_depths, shown};
+  const double *r = view.rotation;
+  const float up[3] = {static_cast<float>(r[6]), static_cast<float>(r[7]),
+                       static_cast<float>(r[8])}; // in camera axes
+  for (int32_t y = row_begin; y < row_end; ++y)
+    for (int32_t x = 0; x < view.width; ++x) {
+      const int64_t i = static_cast<int64_t>(y) * view.width + x;
+      if (inverse_depths[i] <= 0)
+        continue;
+      const float z = 1 / inverse_depths[i];
+      const float from[3] = {(static_cast<float>(x) - view.cx) / view.fx * z,
+                             (static_cast<float>(y) - view.cy) / view.fy * z, z};
+      const float rise = up[0] * from[0] + up[1] * from[1] + up[2] * from[2];
+      if (rise >= 0 || std::abs(view.centre[2] + rise) > kLevel_m)
+        continue;
+      const float away = sqrtf(from[0] * from[0] + from[1] * from[1] + z * z);
+      float along[3], at[2];
+      for (int k = 0; k < 3; ++k)
+        along[k] = (from[k] - 2 * rise * up[k]) / away;
+      for (int k = 0; k < 2; ++k)
+        at[k] = static_cast<float>(view.centre[k] + r[3 * k] * from[0] + r[3 * k + 1] * from[1] +
+                                   r[3 * k + 2] * from[2]);
+      const float share = light.mirrors * mirror_of(-rise / away);
+      const float through = expf(-light.fog_per_m * away);
+      luminance[i] += share * through * film_of(world, light, at[0], at[1]) *
+                      mirror.around(mirror.end_of(from, along));
+    }
+}
 
 void shade_view(const Surroundings &world, const Light &light, const View &view, const int32_t *ids,
                 int32_t row_begin, int32_t row_end, float *luminance) {

@@ -23,6 +23,7 @@ class Light:
         headlights: float,
         windows: float,
         aureole: float,
+        mirrors: float = 0.0,
     ) -> Light: ...
 
 class RenderCamera:
@@ -35,6 +36,7 @@ class RenderCamera:
         width: int,
         height: int,
         baseline_m: float,
+        turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None: ...
 
 class Scene:

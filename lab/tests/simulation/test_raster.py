@@ -140,6 +140,47 @@ def test_the_right_eye_sees_things_further_left() -> None:
     assert middles[0] - middles[1] == pytest.approx(60 * 0.3 / 6, abs=0.6)  # whole pixels
 
 
+def test_the_right_eye_turns_as_calibration_left_it() -> None:
+    scene, texture = _scene()
+    builder = MeshBuilder()
+    corners = [(-1, 6, -1), (1, 6, -1), (1, 6, 1), (-1, 6, 1)]
+    builder.quad(corners, [(0, 1), (1, 1), (1, 0), (0, 0)], texture, Kind.BUILDING)
+    _add(scene, builder.build())
+    middles = []
+    for turn in ((0.0, 0.0, 0.0), (0.0, 4 / 60, 0.0), (4 / 60, 0.0, 0.0)):
+        camera = _town.RenderCamera(60.0, 60.0, 31.5, 23.5, 64, 48, 0.3, turn)
+        seen = scene.render(camera, _NORTH, np.zeros(3), _light())[1]
+        middles.append([np.mean(np.nonzero(eye > 0.1), axis=1) for eye in seen])
+    for changed in middles[1:]:
+        np.testing.assert_array_equal(changed[0], middles[0][0])
+    moved = [changed[1] - middles[0][1] for changed in middles[1:]]
+    assert moved[0] == pytest.approx([0, -4], abs=0.6)  # further left: a larger disparity
+    assert moved[1] == pytest.approx([4, 0], abs=0.6)
+
+
+def test_wet_ground_mirrors_what_stands_there() -> None:
+    """A bright wall is seen in the water before it, and nothing of it beside it."""
+    eye, found = np.array([0.0, 0.0, 1.5]), {}
+    for wall in (False, True):
+        scene, texture = _scene()
+        bright = scene.add_texture(sheet(0.9, 1.0))
+        _add(scene, _floor_and_roof(texture, roof=False))
+        if wall:
+            builder = MeshBuilder()
+            corners = [(-2, 12, 0), (2, 12, 0), (2, 12, 4), (-2, 12, 4)]
+            square = [(0, 1), (1, 1), (1, 0), (0, 0)]
+            builder.quad(corners, square, bright, Kind.BUILDING, glow=30.0)
+            _add(scene, builder.build())
+        light = _light(wet=1.0, mirrors=1.0, windows=1.0)
+        found[wall] = scene.render(_CAMERA, _NORTH, eye, light)[0][0]
+    gain = found[True] - found[False]
+    row = round(23.5 + 60 * 1.5 / 9)  # the ground 9 m ahead: its mirrored ray meets the wall
+    assert gain[row, 28:36].min() > 0.5
+    assert np.abs(gain[row, :12]).max() < 0.05
+    without = scene.render(_CAMERA, _NORTH, eye, _light(wet=1.0, windows=1.0))[0][0]
+    np.testing.assert_array_equal(found[True][:16], without[:16])  # nothing above the ground
+
+
 def test_bad_meshes_are_refused() -> None:
     scene, texture = _scene()
     good = _random_quads(np.random.default_rng(1), 3, texture)

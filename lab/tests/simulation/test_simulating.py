@@ -16,9 +16,10 @@ from engram.sequences.framelog.reader import FrameLog
 from engram.sequences.opening import open_drive
 from engram.sequences.sequence import first_pair_hash, session_of
 from engram_lab.town.campaigns import Campaign, campaign_named
+from engram_lab.town.conditions import World
 from engram_lab.town.session import SimulatedSequence
-from engram_lab.town.simulating import campaign_folder, simulate
-from engram_lab.truth import read_kitti_poses, read_truth
+from engram_lab.town.simulating import campaign_folder, met_path, simulate
+from engram_lab.truth import read_kitti_poses, read_truth, truth_path
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +53,23 @@ def test_frame_logs_hold_every_frame_with_its_truth(short: Campaign, tmp_path: P
         np.testing.assert_allclose(truth.world_from_cam[3].translation, expected, atol=1e-8)
         assert np.median([len(entry.frame.landmarks) for entry in log]) > 60
         log.close()
+
+
+def test_what_a_drive_of_world_6_met_stands_beside_its_truth(tmp_path: Path) -> None:
+    """Frame by frame; the head of the truth says what calibration left of the rig's errors."""
+    rain = replace(campaign_named("hamlet", 2, world=World.SIX), spacing_m=30.0)
+    report = simulate(rain, tmp_path, sessions=[4])
+    target = Path(report.files[0])
+    assert target.parent.name == "hamlet-standard-seed2-v6"
+    rows = np.loadtxt(met_path(target), delimiter=",", skiprows=1)
+    assert rows.shape == (report.frames, 5)
+    rate, cover, sun_deg, exposure = rows[:, 0], rows[:, 1:3], rows[:, 3], rows[:, 4]
+    assert 2 < rate.mean() < 6
+    assert 0.1 < cover.mean() < 0.5
+    assert np.all(sun_deg > 30)
+    assert np.all(exposure > 0.2)
+    residual = SimulatedSequence(rain, 4).drive.residual
+    assert residual.text() in truth_path(target).read_text()
 
 
 def test_what_is_there_is_not_rendered_again(short: Campaign, tmp_path: Path) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.geometry.cameras import StereoCamera
 from engram_lab import _town
 from engram_lab.town.conditions import Moment, World
 from engram_lab.town.drive import Pose, Robot
@@ -17,9 +19,10 @@ Luminance = NDArray[np.float32]
 Grey = NDArray[np.uint8]
 
 _TARGET = 0.4  # exposed luminance that the metered highlights are brought to
-_MOST_GAIN = 26.0
+_MOST_GAIN, _MOST_GAIN_6 = 26.0, 300.0
 _SHUTTER_BY_DAY_S = 0.0007
 _LONGEST_SHUTTER_S = 0.012
+_GLARE = 0.1  # of the sun's power, right beside it
 _CLOTH = 0.002  # share of the light that comes through what covers a lens
 # Drops that sit on the glass in the hardest rain, on 512×384 pixels: three quarters of the picture
 # lie behind one. Odometry mostly bears that; of the nodes about, few match (calibration, row f).
@@ -53,6 +56,31 @@ class Lens:
 CLEAN = Lens()
 
 
+@dataclass(frozen=True, slots=True)
+class Met:
+    """What a drive met at one frame, to slice results by.
+
+    Attributes:
+        rain_mm_h: that falls.
+        cover: share of the left and right pane that drops cover.
+        sun_deg: height of the sun; below 0 at night.
+        exposure: gain of the whole camera; 1 is a bright day's.
+    """
+
+    rain_mm_h: float
+    cover: tuple[float, float]
+    sun_deg: float
+    exposure: float
+
+    HEADER: ClassVar[str] = "rain_mm_h,cover_left,cover_right,sun_deg,exposure"
+
+    def row(self) -> str:
+        """A line of CSV."""
+        left, right = self.cover
+        values = (self.rain_mm_h, left, right, self.sun_deg, self.exposure)
+        return ",".join(f"{value:.4g}" for value in values)
+
+
 class CameraModel:
     """Turns luminance into grey levels; keeps the exposure from frame to frame.
 
@@ -68,6 +96,7 @@ class CameraModel:
         self._seed = seed
         self._lens = lens
         self._gain: float | None = None
+        self._pace = 0.0  # change of its logarithm from frame to frame
         self._sitting = [((-1, -1), np.zeros((0, 0), dtype=np.float32))] * 2
         self._dirt = [self._specks(eye) for eye in range(2)] if lens.dirt > 0 else []
         self._world = world
@@ -75,6 +104,11 @@ class CameraModel:
             Pane(lens.glass, robot.camera, [seed & 0x7FFFFFFF, 0x61A5, eye]) for eye in range(2)
         ]
         self._eyes = [WetLens(pane, robot.camera) for pane in panes]
+
+    def met(self, moment: Moment) -> Met:
+        """What the last pair met."""
+        cover = (self._eyes[0].cover, self._eyes[1].cover)
+        return Met(moment.rain_mm_h, cover, moment.sun_deg, self._gain or 1.0)
 
     def stand_in(self, rate_mm_h: float, speed_m_s: float, seconds: float) -> None:
         """What rain does to the glass of both eyes in so much time at a speed."""
@@ -99,9 +133,12 @@ class CameraModel:
         gain = self._meter(luminance)
         shutter_s = float(np.clip(_SHUTTER_BY_DAY_S * gain, 0.0002, _LONGEST_SHUTTER_S))
         pair = []
+        robot = self._robot
         for eye in range(2):
             light = self._blur(luminance[eye], inverse_depths[eye], pose.twist * shutter_s)
             light = _veil(light, gain)
+            if self._world is World.SIX:
+                light = _glare(light, moment, pose, robot.camera)
             if self._dirt:
                 light = _smudge(light, self._dirt[eye])
             if moment.rain > 0.05:
@@ -109,12 +146,15 @@ class CameraModel:
             if self._world is World.SIX:
                 light = self._rained_on(light, moment, pose, shutter_s, eye)
             noise_seed = (self._seed * 1_000_003 + 2 * frame + eye) & 0xFFFFFFFFFFFF
-            robot = self._robot
+            # A longer shutter brings light, only what it cannot bring is amplified with its noise.
+            amplified = gain
+            if self._world is World.SIX:
+                amplified *= _SHUTTER_BY_DAY_S / shutter_s
             pair.append(
                 _town.develop(
                     np.ascontiguousarray(light, dtype=np.float32), gain,
-                    robot.shot_noise * max(1.0, gain),
-                    robot.read_noise * max(1.0, gain) ** 0.75, robot.vignette, noise_seed,
+                    robot.shot_noise * max(1.0, amplified),
+                    robot.read_noise * max(1.0, amplified) ** 0.75, robot.vignette, noise_seed,
                 )
             )  # fmt: skip
         return pair[0], pair[1]
@@ -124,8 +164,15 @@ class CameraModel:
         rows = luminance.shape[1]
         metered = luminance[0, rows // 6 :: 4, ::4]
         bright = float(np.quantile(metered, 0.85))
-        wanted = min(_TARGET / max(bright, 1e-6), _MOST_GAIN)
-        self._gain = wanted if self._gain is None else self._gain * (wanted / self._gain) ** 0.3
+        most = _MOST_GAIN_6 if self._world is World.SIX else _MOST_GAIN
+        wanted = min(_TARGET / max(bright, 1e-6), most)
+        if self._gain is None:
+            self._gain = wanted
+        elif self._world is World.SIX:  # hunts: it overshoots what it follows
+            self._pace = 0.6 * self._pace + 0.25 * float(np.log(wanted / self._gain))
+            self._gain = min(self._gain * float(np.exp(self._pace)), most)
+        else:
+            self._gain *= (wanted / self._gain) ** 0.3
         return self._gain
 
     def _blur(
@@ -213,6 +260,25 @@ def _veil(light: Luminance, gain: float) -> Luminance:
     )
     grown = cv2.resize(halo, (light.shape[1], light.shape[0]), interpolation=cv2.INTER_LINEAR)
     return np.asarray(light + grown, dtype=np.float32)
+
+
+def _glare(light: Luminance, moment: Moment, pose: Pose, camera: StereoCamera) -> Luminance:
+    """With the light of a sun that stands in the picture, strayed over all of it."""
+    sun = pose.world_from_cam.rotation.T @ moment.sun_direction
+    if moment.sun_power <= 0 or sun[2] < 0.2:
+        return light
+    height, width = light.shape
+    column, row = camera.cx + camera.fx * sun[0] / sun[2], camera.cy + camera.fy * sun[1] / sun[2]
+    if not (0 <= column <= width - 1 and 0 <= row <= height - 1):
+        return light
+    if light[round(row), round(column)] < 0.5 * moment.sun_power:  # something hides it
+        return light
+    rows, columns = np.ogrid[: height // 4, : width // 4]
+    away_deg = np.degrees(
+        np.hypot((4 * columns - column) / camera.fx, (4 * rows - row) / camera.fy)
+    )
+    strayed = np.asarray(_GLARE * moment.sun_power / (1 + (away_deg / 8) ** 2), dtype=np.float32)
+    return np.asarray(light + cv2.resize(strayed, (width, height)), dtype=np.float32)
 
 
 def _smudge(light: Luminance, mask: Luminance) -> Luminance:

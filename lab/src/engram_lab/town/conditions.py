@@ -60,12 +60,12 @@ def clear_sun_power(elevation_sine: float) -> float:
     return 5.2 * math.exp(-0.21 / max(elevation_sine, 0.035))
 
 
-def clear_sky_power(elevation_sine: float) -> float:
+def clear_sky_power(elevation_sine: float, by_night: float = 0.0035) -> float:
     """Mean luminance of a clear sky; falls by about a factor ten for every 3° below −2°."""
     elevation_deg = math.degrees(math.asin(max(-1.0, min(1.0, elevation_sine))))
     if elevation_deg >= 0:
         return 0.14 + 0.53 * math.sqrt(elevation_sine)
-    return max(0.0035, 0.14 * 10 ** (elevation_deg / 3.6))
+    return max(by_night, 0.14 * 10 ** (elevation_deg / 3.6))
 
 
 class World(IntEnum):
@@ -142,8 +142,12 @@ class Moment:
         lamps_on: street lamps and lit windows.
         headlights_on: of the robot and of others.
         rain_mm_h: 0 in world 5.
+        sun_deg: height of the sun.
         aureole: share of the sun's light that comes from around it and fills shadows.
-        beam: power of the robot's headlights.
+        lamp_power: of a street lamp, luminance × m² of a white surface.
+        window: luminance of a lit window.
+        mirrors: how much of what stands there wet ground shows, 0…1.
+        beam: power of the robot's headlights; 1 lights as much as world 5's.
     """
 
     sun_direction: NDArray[np.float64]
@@ -159,13 +163,19 @@ class Moment:
     lamps_on: bool
     headlights_on: bool
     rain_mm_h: float = 0.0
+    sun_deg: float = 0.0
     aureole: float = 0.5
+    lamp_power: float = 7.0
+    window: float = 0.3
+    mirrors: float = 0.0
     beam: float = 1.0
 
 
-# What world 6 is calibrated by (reports/town.md).
+# World 6. Lamps (15 lx below), headlights (30 lx ten metres ahead) and windows (60 cd/m²) as they
+# are beside the sky at dusk: 50 lx from a sun 3° down. Calibrated: reports/town.md.
 _AUREOLE_6 = 0.5
-_BEAM_6 = 1.0
+_LAMP_POWER_6, _WINDOW_6, _BEAM_6 = 0.35, 0.02, 0.4
+_NIGHT_SKY_6 = 0.0003
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,9 +213,24 @@ class Conditions:
     def season(self) -> int:
         """0 with leaves, 1 autumn, 2 bare."""
         day = self.start.timetuple().tm_yday
+        if self.world is World.SIX and self.leaves == 0:
+            return 2
+        if self.world is World.SIX:
+            return 0 if day < 275 else 1
         if 115 <= day < 285:
             return 0
         return 1 if 285 <= day < 325 else 2
+
+    @property
+    def leaves(self) -> float:
+        """Share of the leaves that are out: they come from mid-April, and fall till mid-November.
+
+        World 5 knows three seasons instead.
+        """
+        if self.world is World.FIVE:
+            return 1.0
+        day = self.start.timetuple().tm_yday
+        return float(np.interp(day, [104, 135, 285, 320], [0, 1, 1, 0]))
 
     def at(self, driven_m: float, elapsed_s: float) -> Moment:
         """Light and weather after so far and so long.
@@ -247,8 +272,8 @@ class Conditions:
         rate *= max(0.0, 1 + 1.6 * weather.changes * swing)
         sun = self._sun(0.0)
         cloud = float(np.clip(weather.cloud + weather.changes * swing, 0, 1))
-        shade = _shade(cloud, _drift(self.seed + 1, driven_m))
-        clear = clear_sky_power(float(sun[2]))
+        shade = 1.0 if cloud > 0.97 else _shade(cloud, _drift(self.seed + 1, driven_m))
+        clear = clear_sky_power(float(sun[2]), _NIGHT_SKY_6)
         height_deg = float(np.degrees(np.arcsin(self._sun(elapsed_s)[2])))
         return Moment(
             sun_direction=sun if sun[2] > 0 else np.array([0.0, 0.0, 1.0]),
@@ -265,7 +290,11 @@ class Conditions:
             lamps_on=height_deg < -1.0,
             headlights_on=height_deg < 1.5 or weather.fog_per_m > 0.01 or rate > 0.1,
             rain_mm_h=rate,
+            sun_deg=height_deg,
             aureole=_AUREOLE_6,
+            lamp_power=_LAMP_POWER_6,
+            window=_WINDOW_6,
+            mirrors=1.0,
             beam=_BEAM_6,
         )
 

@@ -67,6 +67,44 @@ ROBOTS: dict[str, Robot] = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class Residual:
+    """What calibration leaves of a stereo rig's errors.
+
+    Attributes:
+        disparity_px: added to every disparity.
+        rows_px: how far the right picture stands too high.
+        roll_rad: of the right camera against the left one.
+        focal: true focal length ÷ the calibrated one.
+    """
+
+    disparity_px: float = 0.0
+    rows_px: float = 0.0
+    roll_rad: float = 0.0
+    focal: float = 1.0
+
+    @staticmethod
+    def of_rig(name: str, seed: int) -> Residual:
+        """That of one robot of a fleet, as good calibrations leave them."""
+        rng = np.random.default_rng([seed & 0x7FFFFFFF, 0xCA11, *name.encode()])
+        disparity, rows, roll, focal = rng.normal(0, [0.2, 0.1, 3e-4, 1e-3])
+        return Residual(float(disparity), float(rows), float(roll), 1 + float(focal))
+
+    def turn(self, camera: StereoCamera) -> tuple[float, float, float]:
+        """Of the right camera against the left one about its axes, radians."""
+        return self.rows_px / camera.fy, self.disparity_px / camera.fx, self.roll_rad
+
+    def text(self) -> str:
+        """For the head of a truth."""
+        return (
+            f"disparity {self.disparity_px:+.3f} px, rows {self.rows_px:+.3f} px, "
+            f"roll {self.roll_rad:+.6f} rad, focal length x {self.focal:.5f}"
+        )
+
+
+EXACT = Residual()
+
+
 def robot_named(name: str) -> Robot:
     """A robot of the fleet.
 

@@ -194,12 +194,25 @@ def add_lamp(builder: MeshBuilder, materials: Materials, foot: Vector, arm: Vect
     return light - _up(0.12)
 
 
+@dataclass(frozen=True, slots=True)
+class Foliage:
+    """What a tree bears on a day.
+
+    Attributes:
+        season: 0 leaves, 1 autumn, 2 bare.
+        leaves: share of them that is out.
+    """
+
+    season: int
+    leaves: float = 1.0
+
+
 def add_tree(
     wood: MeshBuilder,
     green: MeshBuilder,
     materials: Materials,
     foot: Vector,
-    season: int,
+    foliage: Foliage,
     rng: np.random.Generator,
 ) -> None:
     """A trunk with limbs in `wood`, a crown of sprays in `green`."""
@@ -219,7 +232,8 @@ def add_tree(
             fork = start + (end - start) * rng.uniform(0.4, 0.95)
             tip = fork + (lean + rng.normal(0, 0.7, 3)) * 0.35 * radius_m
             _add_limb(wood, materials, fork, tip, 0.022)
-    for _ in range(int(55 * radius_m)):
+    sprays = int(55 * radius_m)
+    for number in range(sprays):
         direction = rng.standard_normal(3)
         direction *= rng.uniform(0.25, 1) ** 0.4 / np.linalg.norm(direction)
         middle = crown + direction * [radius_m, radius_m, tall_m]
@@ -228,10 +242,11 @@ def add_tree(
         corners = [
             middle + size_m * (a * right + b * up) for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))
         ]
-        texture = materials.foliage[season][int(rng.integers(4))]
+        texture = materials.foliage[foliage.season][int(rng.integers(4))]
         square = [(0, 1), (1, 1), (1, 0), (0, 0)]
         tint = float(np.clip(1 + 0.12 * rng.standard_normal(), 0.6, 1.4))
-        green.quad(corners, square, texture, Kind.VEGETATION, _LEAF, tint)
+        if number < foliage.leaves * sprays or foliage.season == 2:
+            green.quad(corners, square, texture, Kind.VEGETATION, _LEAF, tint)
 
 
 def _add_limb(

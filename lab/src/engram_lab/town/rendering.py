@@ -15,16 +15,14 @@ from engram.geometry.se3 import SE3
 from engram_lab import _town
 from engram_lab.town.camera_model import CLEAN, CameraModel, Lens
 from engram_lab.town.conditions import Conditions, Moment, World
-from engram_lab.town.drive import Pose, Robot, driving_line, pose_on, robot_named
+from engram_lab.town.drive import EXACT, Pose, Residual, Robot, driving_line, pose_on, robot_named
 from engram_lab.town.mesh import Mesh
-from engram_lab.town.streets import Junction, loop_of_length
-from engram_lab.town.textures import Style
+from engram_lab.town.streets import Alteration, Junction, alterations_on, loop_of_length
+from engram_lab.town.textures import Style, style_of
 from engram_lab.town.town import Tile, Today, Town
 
 _AHEAD_M = 170.0  # how far tiles are kept around the camera
-_LAMP_POWER = 7.0
 _LAMP_RANGE_M = 22.0
-_WINDOW_LUMINANCE = 0.3
 
 
 class TownRenderer:
@@ -34,10 +32,14 @@ class TownRenderer:
         town: what there is.
         today: what is there today.
         threads: of the renderer.
+        residual: what calibration leaves of its rig's errors.
     """
 
-    def __init__(self, town: Town, today: Today, threads: int = 1) -> None:
+    def __init__(
+        self, town: Town, today: Today, threads: int = 1, residual: Residual = EXACT
+    ) -> None:
         self.town = town
+        self._residual = residual
         self._today = today
         self._threads = threads
         self._tiles: dict[Junction, Tile] = {}
@@ -48,13 +50,10 @@ class TownRenderer:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Luminance and inverse depth, each (2, height, width) float32: left, right."""
         self._stand_ready(world_from_cam)
-        self._light_lamps(moment.lamps_on)
+        self._light_lamps(moment)
         self._set_moving(moving)
         luminance, inverse_depths = self.town.scene.render(
-            _town.RenderCamera(
-                camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
-                camera.baseline_m,
-            ),
+            self._camera(camera),
             np.ascontiguousarray(world_from_cam.rotation),
             world_from_cam.translation,
             _light(moment, world_from_cam),
@@ -74,14 +73,19 @@ class TownRenderer:
         self._stand_ready(world_from_cam)
         self._set_moving(moving)
         depth_m, kinds = self.town.scene.depth(
-            _town.RenderCamera(
-                camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
-                camera.baseline_m,
-            ),
+            self._camera(camera),
             np.ascontiguousarray(world_from_cam.rotation),
             world_from_cam.translation,
         )  # fmt: skip
         return depth_m, kinds
+
+    def _camera(self, camera: StereoCamera) -> _town.RenderCamera:
+        """The true camera, a residual off the calibrated one."""
+        residual = self._residual
+        return _town.RenderCamera(
+            camera.fx * residual.focal, camera.fy * residual.focal, camera.cx, camera.cy,
+            camera.width, camera.height, camera.baseline_m, residual.turn(camera),
+        )  # fmt: skip
 
     def leave(self) -> None:
         """Takes its tiles out of the town's scene; they come back when it renders again."""
@@ -106,7 +110,8 @@ class TownRenderer:
                 self._tiles[block] = self.town.build_tile(block, self._today)
                 self._lamps_on = None
 
-    def _light_lamps(self, lamps_on: bool) -> None:
+    def _light_lamps(self, moment: Moment) -> None:
+        lamps_on = moment.lamps_on
         if lamps_on is self._lamps_on:
             return
         self._lamps_on = lamps_on
@@ -114,7 +119,7 @@ class TownRenderer:
         lamps = np.concatenate(places) if places and lamps_on else np.zeros((0, 3))
         rows = np.empty((len(lamps), 5), dtype=np.float32)
         rows[:, :3] = lamps
-        rows[:, 3:] = (_LAMP_POWER, _LAMP_RANGE_M)
+        rows[:, 3:] = (moment.lamp_power, _LAMP_RANGE_M)
         self.town.scene.set_lamps(rows)
 
     def _set_moving(self, moving: Mesh | None) -> None:
@@ -146,24 +151,30 @@ def _light(moment: Moment, world_from_cam: SE3) -> _town.Light:
         wet=moment.wet,
         snow=moment.snow,
         headlights=moment.beam if moment.headlights_on else 0.0,
-        windows=_WINDOW_LUMINANCE if moment.lamps_on else 0.0,
+        windows=moment.window if moment.lamps_on else 0.0,
         aureole=moment.aureole,
+        mirrors=moment.mirrors,
     )
 
 
 LOOP_M = 150.0
 _PLACES_EVERY_M = 5.0
+_FIRST_DAY = datetime(2025, 7, 1, tzinfo=UTC).toordinal()  # from which a world 6 changes
 _IN_RAIN_S = 120.0  # how long it has rained on the glass when a place is seen
 
 
 @dataclass(frozen=True, slots=True)
 class Visit:
-    """One pass through the places: when, in what weather, on which day's parking."""
+    """One pass through the places: when, in what weather, on which day's parking.
+
+    In world 6 the rain may have another rate than the weather's.
+    """
 
     name: str
     start: datetime
     weather: str
     day: int
+    rain_mm_h: float | None = None
 
 
 def at(month: int, day: int, hour: float) -> datetime:
@@ -205,7 +216,7 @@ class Places:
         self._world, self._lens = world, lens
         plan, route = loop_of_length(LOOP_M, seed)
         self.robot: Robot = robot_named(robot)
-        self._town = Town(plan, route, style or Style())
+        self._town = Town(plan, route, style or style_of(world))
         self._line = driving_line(plan, route, reverse=False)
         self._starts_m = np.arange(0, self._line.length_m, every_m)
 
@@ -251,9 +262,19 @@ class Places:
         return [renderer.depth(pose, self.robot.camera)[0] for pose in world_from_cams]
 
     def _conditions(self, visit: Visit) -> Conditions:
-        return Conditions(visit.start, visit.weather, visit.day, world=self._world)
+        return Conditions(
+            visit.start, visit.weather, visit.day, world=self._world, rain_mm_h=visit.rain_mm_h
+        )
+
+    def _changes(self, visit: Visit) -> frozenset[Alteration]:
+        """What has been built since the year began; in world 5 nothing is."""
+        if self._world is World.FIVE:
+            return frozenset()
+        return alterations_on(self._town.plan.seed, visit.start.toordinal() - _FIRST_DAY)
 
     def _renderer(self, visit: Visit) -> TownRenderer:
         conditions = self._conditions(visit)
-        today = Today(visit.day, conditions.hour, conditions.season, 0.45)
+        today = Today(
+            visit.day, conditions.hour, conditions.season, 0.45, self._changes(visit), self._world
+        )
         return TownRenderer(self._town, today)

@@ -15,14 +15,24 @@ from engram.geometry.se3 import SE3
 from engram.graph.model import Clock
 from engram.sequences.motion_files import Trajectory
 from engram.sequences.sequence import SequenceInfo
-from engram_lab.town.camera_model import CameraModel
+from engram_lab.town.camera_model import CameraModel, Met
 from engram_lab.town.campaigns import Campaign, SessionPlan
 from engram_lab.town.conditions import Conditions, World
-from engram_lab.town.drive import DrivingStyle, Line, Pose, Robot, drive, driving_line, robot_named
+from engram_lab.town.drive import (
+    EXACT,
+    DrivingStyle,
+    Line,
+    Pose,
+    Residual,
+    Robot,
+    drive,
+    driving_line,
+    robot_named,
+)
 from engram_lab.town.mesh import FrameTruth, Mesh
 from engram_lab.town.rendering import TownRenderer
 from engram_lab.town.streets import Route, StreetPlan, alterations_on
-from engram_lab.town.textures import Style
+from engram_lab.town.textures import Style, style_of
 from engram_lab.town.town import Life, Today, Town
 
 _MOST_THREADS = 256  # of the core
@@ -54,8 +64,16 @@ class SimulatedDrive:
         self.plan: SessionPlan = campaign.session(session)
         self.robot: Robot = robot or robot_named(self.plan.robot)
         self.conditions = Conditions(
-            self.plan.start, self.plan.weather, self.plan.seed, campaign.place, campaign.world
+            self.plan.start,
+            self.plan.weather,
+            self.plan.seed,
+            campaign.place,
+            campaign.world,
+            self.plan.rain_mm_h,
         )
+        six = campaign.world is World.SIX
+        self.residual = Residual.of_rig(self.robot.name, campaign.seed) if six else EXACT
+        self.met: list[Met] = []  # by the frames of the last pass
         self._threads = threads
         self._stage: TownRenderer | None = None
         self._life: Life | None = None
@@ -82,6 +100,7 @@ class SimulatedDrive:
         """Pairs `start` to `stop`; the exposure settles again at the first."""
         world = self.campaign.world
         camera_model = CameraModel(self.robot, self.plan.seed, self.plan.lens, world)
+        self.met = []
         if world is World.SIX:
             self._drive_through_rain(camera_model, start)
         for k, pose in enumerate(self.poses[start:stop], start):
@@ -93,6 +112,7 @@ class SimulatedDrive:
                 pose.world_from_cam, self.camera, moment, self._moving(pose)
             )
             left, right = camera_model.expose(luminance, inverse_depths, pose, moment, k)
+            self.met.append(camera_model.met(moment))
             yield StereoPair(self.stamp_ns(k), left, right, self.camera)
 
     def _drive_through_rain(self, camera_model: CameraModel, start: int) -> None:
@@ -131,28 +151,33 @@ class SimulatedDrive:
             self.conditions.season,
             float(np.clip(self.campaign.parked_share + rng.normal(0, 0.1), 0, 1)),
             alterations_on(self.campaign.seed, day - self.campaign.first_day),
+            self.campaign.world,
+            self.conditions.leaves,
         )
+
+    def _town(self) -> Town:
+        return _town_of(self._streets, self._route, style_of(self.campaign.world))
 
     def _renderer(self) -> TownRenderer:
         if self._stage is None:
-            town = _town(self._streets, self._route)
-            self._stage = TownRenderer(town, self.today(), self._threads)
+            town = self._town()
+            self._stage = TownRenderer(town, self.today(), self._threads, self.residual)
         return self._stage
 
     def _moving(self, pose: Pose) -> Mesh:
         if self._life is None:
             self._life = Life(
-                _town(self._streets, self._route).cast, self._streets, self._driven, self.line,
-                self.plan.reverse, self.campaign.traffic, self.plan.seed,
+                self._town().cast, self._streets, self._driven, self.line, self.plan.reverse,
+                self.campaign.traffic, self.plan.seed, self.campaign.world,
             )  # fmt: skip
         position = pose.world_from_cam.translation[:2]
         return self._life.around(position, pose.driven_m, pose.elapsed_s)
 
 
 @lru_cache(maxsize=2)
-def _town(streets: StreetPlan, route: Route) -> Town:
+def _town_of(streets: StreetPlan, route: Route, style: Style) -> Town:
     """Towns are costly to begin; the sessions of a campaign share one."""
-    return Town(streets, route, Style())
+    return Town(streets, route, style)
 
 
 class SimulatedSequence:

@@ -33,7 +33,9 @@ from engram.sequences.framelog.log_writer import FrameLogWriter
 from engram.sequences.framelog.reader import FrameLog
 from engram.sequences.motion_files import write_tum
 from engram.sequences.sequence import LoggedFrame
-from engram_lab.town.campaigns import WORLD_VERSION, Campaign
+from engram_lab.town.camera_model import Met
+from engram_lab.town.campaigns import Campaign
+from engram_lab.town.conditions import World
 from engram_lab.town.session import SimulatedSequence
 from engram_lab.truth import truth_path
 
@@ -163,7 +165,7 @@ def campaigns_folder() -> Path:
 
 def campaign_folder(out: Path, campaign: Campaign) -> Path:
     """Where a campaign's sessions stand below `out`: by campaign, seed, size and world version."""
-    name = f"{campaign.home}-{campaign.size.value}-seed{campaign.seed}-v{WORLD_VERSION}"
+    name = f"{campaign.home}-{campaign.size.value}-seed{campaign.seed}-v{campaign.world}"
     return out / name
 
 
@@ -292,7 +294,16 @@ def _render(task: _Task, monitor: Monitor) -> None:
         raise KeyboardInterrupt
     plan = sequence.drive.plan
     comments = [f"{plan.name}: {plan.weather}, {plan.start:%Y-%m-%d %H:%M} UTC, {plan.robot}"]
+    if task.campaign.world is World.SIX:
+        comments.append(f"rig: {sequence.drive.residual.text()}")
+        rows = [Met.HEADER, *(met.row() for met in sequence.drive.met)]
+        _write(met_path(task.target), ("\n".join(rows) + "\n").encode())
     write_tum(truth_path(task.target), sequence.truth(), comments)
+
+
+def met_path(target: Path) -> Path:
+    """What a drive met, next to its frame log."""
+    return target.with_suffix(".met.csv")
 
 
 def _write_images(sequence: SimulatedSequence, target: Path, monitor: Monitor) -> None:

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from engram_lab.town.conditions import World
+
 Field = NDArray[np.float32]
 
 SIDE = 1024  # texels of a field; far larger than what is cut from it, so that cuts differ
@@ -95,6 +97,15 @@ class Style:
 
     paint_contrast: float = 0.21
     relief: float = 2.2
+
+
+# World 6: calibrated by what low sun and night cost on real roads (reports/town.md).
+_STYLE_6 = Style(paint_contrast=0.45, relief=1.3)
+
+
+def style_of(world: World) -> Style:
+    """Of a world's textures."""
+    return _STYLE_6 if world is World.SIX else Style()
 
 
 def pack(

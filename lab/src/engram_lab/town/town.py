@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram_lab import _town
+from engram_lab.town.conditions import World
 from engram_lab.town.drive import Line, closed_line, driving_line
 from engram_lab.town.furniture import (
+    Foliage,
     Front,
     Materials,
     add_bench,
@@ -53,6 +55,8 @@ from engram_lab.town.textures import Facade, NoiseFields, Style, carriageway, fa
 _SEEN_M = 75.0
 _MODELS = 6
 _STRIDES = 4
+# To the middle of a car that the robot queues behind: it hides half of the lower picture.
+_QUEUED_M = 5.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,12 +110,14 @@ class Life:
         reverse: whether it drives the other way round.
         traffic: how much moves, 0…1.
         seed: of the session.
+        world: how near the car ahead comes.
     """
 
     def __init__(
         self, cast: Cast, plan: StreetPlan, route: Route, line: Line, reverse: bool,
-        traffic: float, seed: int,
+        traffic: float, seed: int, world: World = World.FIVE,
     ) -> None:  # fmt: skip
+        self._nearest_m = _QUEUED_M if world is World.SIX else 11.0
         rng = np.random.default_rng([seed & 0x7FFFFFFF, 0x11FE])
         self._cast = cast
         self._own = line
@@ -157,9 +163,11 @@ class Life:
         return Mesh.joined(parts)
 
     def _lead(self, driven_m: float) -> list[Mesh]:
-        """A car ahead, which falls back to 11 m and draws away out of sight in turns."""
+        """A car ahead, which falls back and draws away out of sight in turns."""
         waves = np.sin(driven_m / np.array([140.0, 95.0]) + self._lead_phase).sum() / 2
-        gap_m = 11.0 + 75.0 * float(np.clip(0.95 - 0.75 * self._traffic + 0.8 * waves, 0, 1.2))
+        gap_m = self._nearest_m + 75.0 * float(
+            np.clip(0.95 - 0.75 * self._traffic + 0.8 * waves, 0, 1.2)
+        )
         if gap_m > _SEEN_M:
             return []
         where, heading, _ = self._own.at(driven_m + gap_m)
@@ -192,6 +200,7 @@ _POOL = 16  # distinct coarse fronts
 _DEPTH_M = 8.5  # of terraced houses
 _PAVEMENT_M = 2.6  # where all are alike
 _BEHIND = 0.3  # how fast an end wall falls back behind the fronts round the corner, metres a metre
+_REBUILDS = 5  # of so many repainted fronts one is rebuilt in world 6
 _SHARED_STREET_M = 24.0  # after which the tarmac of side streets repeats
 
 
@@ -205,6 +214,8 @@ class Today:
         season: 0 leaves, 1 autumn, 2 bare.
         parked_share: of the parking places taken, 0…1.
         alterations: structural changes in force.
+        world: how life is made.
+        leaves: share of the leaves that are out.
     """
 
     day: int
@@ -212,6 +223,8 @@ class Today:
     season: int
     parked_share: float
     alterations: frozenset[Alteration] = frozenset()
+    world: World = World.FIVE
+    leaves: float = 1.0
 
 
 @dataclass(slots=True, eq=False)
@@ -373,6 +386,7 @@ class _TileBuilder:
                 block[1] + 100_000,
             ]
         )
+        self._foliage = Foliage(today.season, today.leaves)
         self.solid, self.green = MeshBuilder(), MeshBuilder()
         self.parts: list[Mesh] = []
         self.lamps: list[tuple[float, ...]] = []
@@ -602,7 +616,7 @@ class _TileBuilder:
         for share in (0.15, 0.85):
             if self.rng.random() < 0.5:
                 foot = a + (b - a) * share + 2.3 * inwards
-                add_tree(self.solid, self.green, self.materials, foot, self.today.season, self.rng)
+                add_tree(self.solid, self.green, self.materials, foot, self._foliage, self.rng)
 
     def _add_house(
         self, side: _Side, at_m: float, width_m: float, setback_m: float, depth_m: float,
@@ -618,6 +632,9 @@ class _TileBuilder:
         height = 3.6 + 3.1 * storeys + float(self.rng.uniform(0.6, 1.2))
         texels = facade(self.rng, self.town.noise, self.town.style, width_m, height)
         house = (self.block, len(self.textures))
+        if self._rebuilt(house):  # from a generator of its own: the next houses stay as they are
+            own = np.random.default_rng([self.plan.seed, 0x8E8, house[1], *np.abs(self.block)])
+            texels = facade(own, self.town.noise, self.town.style, width_m, height)
         tint = self._repainted(house)
         plane = Front(
             _level(corner), np.array([*side.along, 0.0]), self._texture(texels.texels),
@@ -649,6 +666,15 @@ class _TileBuilder:
 
     def _altered(self, house: tuple[Junction, int], kind: AlterationKind) -> bool:
         return any(a.kind is kind and a.chooses(*house) for a in self.today.alterations)
+
+    def _rebuilt(self, house: tuple[Junction, int]) -> bool:
+        """Whether works have changed a front: in world 6, after one alteration of five."""
+        if self.today.world is World.FIVE:
+            return False
+        return any(
+            a.kind is AlterationKind.REPAINT and a.number % _REBUILDS == 0 and a.chooses(*house)
+            for a in self.today.alterations
+        )
 
     def _repainted(self, house: tuple[Junction, int]) -> float:
         tint = float(self.rng.uniform(0.85, 1.15))
@@ -682,7 +708,7 @@ class _TileBuilder:
         for _ in range(int(self.plan.spacing_m / 4)):
             target = front[int(self.rng.integers(12))]
             foot = _level(middle + (target - middle) * self.rng.uniform(0.2, 0.88))
-            add_tree(self.solid, self.green, self.materials, foot, self.today.season, self.rng)
+            add_tree(self.solid, self.green, self.materials, foot, self._foliage, self.rng)
 
     def _add_square(self, front: Points) -> None:
         self._add_lawn(front, self.town._slabs, 1 / 3)
@@ -730,7 +756,7 @@ class _TileBuilder:
         # Each thing draws from its own generator: one that is gone changes none of the others.
         rng = np.random.default_rng(self.rng.integers(2**32))
         if lot < 0.3 and not felled:
-            add_tree(self.solid, self.green, self.materials, foot, self.today.season, rng)
+            add_tree(self.solid, self.green, self.materials, foot, self._foliage, rng)
         elif 0.3 <= lot < 0.42 or fresh:
             add_sign(self.solid, self.materials, foot, along * rng.choice([-1, 1]), rng)
         elif 0.42 <= lot < 0.54:
