@@ -90,6 +90,8 @@ def pivoted_errors(
     covariances: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]: ...
 
+NOT_LOADED: int
+
 class GraphArrays:
     def __init__(
         self,
@@ -121,30 +123,42 @@ def graph_candidates(
     reference_from_live: NDArray[np.float64],
     live_error: NDArray[np.float64],
     limits: CandidateLimits,
-) -> tuple[
-    NDArray[np.int32],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-]: ...
+) -> (
+    tuple[
+        tuple[
+            NDArray[np.int32],
+            NDArray[np.float64],
+            NDArray[np.float64],
+            NDArray[np.float64],
+            NDArray[np.float64],
+            NDArray[np.float64],
+            NDArray[np.float64],
+            NDArray[np.float64],
+            NDArray[np.float64],
+        ],
+        None,
+    ]
+    | tuple[None, NDArray[np.int32]]
+): ...
 def graph_chains(
     graph: GraphArrays,
     root: int,
     goals: NDArray[np.int32],
     edges: NDArray[np.int32] | None = None,
     closed: NDArray[np.int32] | None = None,
-) -> tuple[
-    NDArray[np.int32],
-    NDArray[np.int32],
-    NDArray[np.int32],
-    NDArray[np.float64],
-    NDArray[np.float64],
-]: ...
+) -> (
+    tuple[
+        tuple[
+            NDArray[np.int32],
+            NDArray[np.int32],
+            NDArray[np.int32],
+            NDArray[np.float64],
+            NDArray[np.float64],
+        ],
+        None,
+    ]
+    | tuple[None, NDArray[np.int32]]
+): ...
 
 # --- transforms
 

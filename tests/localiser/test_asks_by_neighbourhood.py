@@ -3,9 +3,9 @@
 A map may be larger than memory: a loop that touches every node, edge or path could not run on one
 that is read page by page. What still looks at the whole map, and when:
 
-* opening a map for ranking: `Lessons.learnt` and the counts of match basins, over all attempts;
+* opening a map for ranking: the counts of match basins, over all attempts;
 * a lost robot: place recognition compares with every node, `PlaceBelief` spreads over all edges;
-* a mapper: loops are looked for among all nodes, and a tie that closes a chain masks all edges;
+* a mapper: it takes the whole graph;
 * the centre and pictures: components, regions, lay-out, downloads, differences and checks.
 """
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from tests.builders import TOWN, TOWN_ROAD, drive, localised
 
-from engram.graph.graph import ExperienceGraph
+from engram.graph.pages import PagedGraph
 from engram.graph.paths import PathMemory
 from engram.localiser.localisation import Position
 from engram.maps.map import Map
@@ -34,7 +34,7 @@ def _refuse(name: str) -> property:
     return property(asked)
 
 
-class AskedGraph(ExperienceGraph):
+class AskedGraph(PagedGraph):
     """A graph that answers questions about nodes and their surroundings only."""
 
     nodes = _refuse("nodes")
@@ -63,21 +63,24 @@ def test_the_localising_loop_enumerates_nothing(town: Path, policy: str) -> None
             opened, live[0].frame.camera, Settings(), policy=policy, relocaliser=None
         ) as localiser,
     ):
-        localiser.place_at(Position.at(opened.graph.node(0).id))
-        opened.graph.__class__, opened.path_memory.__class__ = AskedGraph, AskedPaths
+        localiser.place_at(Position.at(localiser.graph.node(0).id))
+        localiser.graph.__class__, localiser._paths.__class__ = AskedGraph, AskedPaths
         found = localised(localiser, live)
+        assert opened._contents is None, "the whole map was read"
     assert all(one.node is not None for one in found)
 
 
 def test_the_doubles_do_refuse(town: Path) -> None:
     with Map.open(town) as opened:
-        opened.graph.__class__, opened.path_memory.__class__ = AskedGraph, AskedPaths
+        graph = opened.read_graph()
+        paths = PathMemory(graph, pages=opened.pages)
+        graph.__class__, paths.__class__ = AskedGraph, AskedPaths
         for asks in (
-            lambda: opened.graph.nodes,
-            lambda: opened.graph.components,
-            lambda: opened.graph.edges,
-            lambda: opened.graph.half_edges(2.0),
-            lambda: opened.path_memory.paths,
+            lambda: graph.nodes,
+            lambda: graph.components,
+            lambda: graph.edges,
+            lambda: graph.half_edges(2.0),
+            lambda: paths.paths,
         ):
             with pytest.raises(EnumeratedError):
                 asks()

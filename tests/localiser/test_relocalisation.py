@@ -46,6 +46,14 @@ class _Nodes:
     def __len__(self) -> int:
         return self.count
 
+    edge_count = 0
+
+    def ids(self, first: int) -> range:
+        return range(first, self.count)
+
+    def holds(self, index: int) -> bool:
+        return index < self.count
+
     def node(self, index: int) -> SimpleNamespace:
         return SimpleNamespace(id=index)
 

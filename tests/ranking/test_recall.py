@@ -13,7 +13,7 @@ from engram import _core
 from engram.graph.basin import prior_basin_m
 from engram.graph.model import PathEntry, PathEntryKind, path_id
 from engram.graph.paths import Attempts, PathMemory
-from engram.ranking.context import UNKNOWN_BASE, Lessons
+from engram.ranking.lessons import UNKNOWN_BASE, Lessons
 from engram.ranking.recall import RECALL, RecallPolicy
 from engram.ranking.recent import AttemptHistory
 from engram.testing.contracts import (

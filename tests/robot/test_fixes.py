@@ -46,6 +46,9 @@ def test_suggested_nodes_take_half_of_the_attempts_and_are_not_repeated() -> Non
         def __len__(self) -> int:
             return 40
 
+        def holds(self, index: int) -> bool:
+            return index < 40
+
     finder = Suggested(Exhaustive(Graph(), None), lambda _: [30, 20, 10])  # type: ignore[arg-type]
     frame: Frame = None  # type: ignore[assignment]
     first = finder.propose(frame, 4, lambda _: True)

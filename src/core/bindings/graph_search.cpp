@@ -56,6 +56,12 @@ void check_node(const engram::GraphView &graph, int64_t node, const char *name) 
                                 ": the graph has " + std::to_string(graph.node_count) + " nodes");
 }
 
+// (None, nodes to load): what a search returns that came to nodes that have not been loaded.
+nb::tuple lacking(std::vector<int32_t> &&absent) {
+  const size_t count = absent.size();
+  return nb::make_tuple(nb::none(), engram::to_numpy(std::move(absent), {count}));
+}
+
 auto graph_candidates(const Graph &arrays, int64_t reference,
                       const Input<double, 1> &reference_from_live,
                       const Input<double, 1> &live_error, const engram::CandidateLimits &limits) {
@@ -71,12 +77,15 @@ auto graph_candidates(const Graph &arrays, int64_t reference,
                                      arrays.sessions.data(),
                                      arrays.driven_m.data()};
   engram::Candidates found;
+  std::vector<int32_t> absent;
   {
     nb::gil_scoped_release unlocked;
-    ENGRAM_CALL(find_candidates, graph, query, found);
+    ENGRAM_CALL(find_candidates, graph, query, found, absent);
   }
+  if (!absent.empty())
+    return lacking(std::move(absent));
   const size_t count = found.nodes.size();
-  return nb::make_tuple(engram::to_numpy(std::move(found.nodes), {count}),
+  return nb::make_tuple(nb::make_tuple(engram::to_numpy(std::move(found.nodes), {count}),
                         engram::to_numpy(std::move(found.node_from_live), {count, 4, 4}),
                         engram::to_numpy(std::move(found.distance_m), {count}),
                         engram::to_numpy(std::move(found.along_m), {count}),
@@ -84,7 +93,7 @@ auto graph_candidates(const Graph &arrays, int64_t reference,
                         engram::to_numpy(std::move(found.yaw_rad), {count}),
                         engram::to_numpy(std::move(found.sigma_m), {count}),
                         engram::to_numpy(std::move(found.sigma_yaw_rad), {count}),
-                        engram::to_numpy(std::move(found.pivot_in_node), {count, 3}));
+                        engram::to_numpy(std::move(found.pivot_in_node), {count, 3})), nb::none());
 }
 
 auto graph_chains(const Graph &arrays, int64_t root, const Input<int32_t, 1> &goals,
@@ -108,12 +117,12 @@ auto graph_chains(const Graph &arrays, int64_t root, const Input<int32_t, 1> &go
                closed ? static_cast<int64_t>(closed->shape(0)) : 0};
   const engram::SearchLimits limits{nullptr,          0, 0, 0, edges ? &passage : nullptr,
                                     ascending.data(), static_cast<int32_t>(ascending.size())};
-  std::vector<int32_t> nodes, parents, halves;
+  std::vector<int32_t> nodes, parents, halves, absent;
   std::vector<double> poses, errors_out;
   {
     nb::gil_scoped_release unlocked;
     std::vector<engram::Reached> reached;
-    ENGRAM_CALL(search_chains, graph, static_cast<int32_t>(root), limits, reached);
+    ENGRAM_CALL(search_chains, graph, static_cast<int32_t>(root), limits, reached, absent);
     for (const engram::Reached &row : reached) {
       nodes.push_back(row.node);
       parents.push_back(row.parent);
@@ -123,12 +132,14 @@ auto graph_chains(const Graph &arrays, int64_t root, const Input<int32_t, 1> &go
       errors_out.insert(errors_out.end(), {e.tau, e.s0, e.s1[0], e.s1[1], e.s1[2], e.s2});
     }
   }
+  if (!absent.empty())
+    return lacking(std::move(absent));
   const size_t count = nodes.size();
-  return nb::make_tuple(engram::to_numpy(std::move(nodes), {count}),
+  return nb::make_tuple(nb::make_tuple(engram::to_numpy(std::move(nodes), {count}),
                         engram::to_numpy(std::move(parents), {count}),
                         engram::to_numpy(std::move(halves), {count}),
                         engram::to_numpy(std::move(poses), {count, 12}),
-                        engram::to_numpy(std::move(errors_out), {count, 6}));
+                        engram::to_numpy(std::move(errors_out), {count, 6})), nb::none());
 }
 
 // By Cholesky's factor; false for what is no number.
@@ -180,6 +191,7 @@ auto pivoted_errors(const Input<double, 3> &covariances) {
 } // namespace
 
 void bind_graph_search(nb::module_ &module) {
+  module.attr("NOT_LOADED") = engram::not_loaded;
   module.def("pivoted_error", &pivoted_error, "covariance"_a,
              "The error model (5,) tau, v, pivot of a covariance (6, 6).");
   module.def("greatest_sigma", &greatest_sigma, "covariance"_a,
@@ -208,11 +220,12 @@ void bind_graph_search(nb::module_ &module) {
       .def_rw("own_exclusion_m", &engram::CandidateLimits::own_exclusion_m);
   module.def("graph_candidates", &graph_candidates, "graph"_a, "reference"_a,
              "reference_from_live"_a, "live_error"_a, "limits"_a,
-             "Columns of a Neighbourhood: the nodes near the live camera.");
+             "Columns of a Neighbourhood, the nodes near the live camera, and None; or None and the "
+             "nodes (n,) that must be loaded first, whose first half is NOT_LOADED.");
   module.def("graph_chains", &graph_chains, "graph"_a, "root"_a, "goals"_a,
              "edges"_a = nb::none(), "closed"_a = nb::none(),
              "Least uncertain chains from a root: nodes (N,), parent rows (N,), half edges (N,), "
              "root_from_node (N, 12), errors (N, 6: tau, s0, s1, s2). Usable are `edges`, and those "
              "that touch none of the `closed` nodes; without `closed` no other edge, without "
-             "`edges` all.");
+             "`edges` all. With None after it; or None and the nodes (n,) to load first.");
 }

@@ -79,8 +79,9 @@ thread_local Scratch scratch;
 
 class Search {
 public:
-  Search(const GraphView &graph, const SearchLimits &limits, std::vector<Reached> &seen)
-      : graph_(graph), limits_(limits), seen_(seen) {
+  Search(const GraphView &graph, const SearchLimits &limits, std::vector<Reached> &seen,
+         std::vector<int32_t> &absent)
+      : graph_(graph), limits_(limits), seen_(seen), absent_(absent) {
     if (scratch.row_of.size() < static_cast<size_t>(graph.node_count))
       scratch.row_of.resize(static_cast<size_t>(graph.node_count), -1);
     scratch.heap.clear();
@@ -170,6 +171,10 @@ private:
 
   void expand(int32_t row) {
     const int32_t node = seen_[static_cast<size_t>(row)].node;
+    if (graph_.first_half[node] == not_loaded) {
+      absent_.push_back(node);
+      return;
+    }
     for (int32_t half = graph_.first_half[node]; half != -1; half = graph_.next_half[half]) {
       // Each half edge leaves one node, and each node is expanded once.
       if (half < 0 || half >= 2 * graph_.edge_count || ++half_edges_ > 2 * graph_.edge_count)
@@ -235,6 +240,7 @@ private:
   const GraphView &graph_;
   const SearchLimits &limits_;
   std::vector<Reached> &seen_;
+  std::vector<int32_t> &absent_;
   int64_t half_edges_ = 0;
 };
 
@@ -385,11 +391,11 @@ double greatest_variance(const double *covariance) {
 }
 
 void search_chains(const GraphView &graph, int32_t root, const SearchLimits &limits,
-                   std::vector<Reached> &reached) {
+                   std::vector<Reached> &reached, std::vector<int32_t> &absent) {
   std::vector<Reached> seen;
   std::vector<int32_t> order, place;
   {
-    Search search(graph, limits, seen);
+    Search search(graph, limits, seen, absent);
     order = search.run(root);
   }
   place.assign(seen.size(), -1);
@@ -403,7 +409,8 @@ void search_chains(const GraphView &graph, int32_t root, const SearchLimits &lim
   }
 }
 
-void find_candidates(const GraphView &graph, const CandidateQuery &query, Candidates &found) {
+void find_candidates(const GraphView &graph, const CandidateQuery &query, Candidates &found,
+                     std::vector<int32_t> &absent) {
   // The reference may lie behind, after a while on odometry alone: reach at least as far as it.
   const double *live = query.reference_from_live + 9;
   const CandidateLimits &asked = query.limits;
@@ -413,7 +420,7 @@ void find_candidates(const GraphView &graph, const CandidateQuery &query, Candid
   std::vector<const Reached *> chains;
   std::vector<int32_t> vague;
   {
-    Search search(graph, limits, near);
+    Search search(graph, limits, near, absent);
     for (const int32_t row : search.run(query.reference)) {
       const Reached &chain = near[static_cast<size_t>(row)];
       if (variance_at(chain.error, live) <= asked.vague_m * asked.vague_m)
@@ -427,7 +434,7 @@ void find_candidates(const GraphView &graph, const CandidateQuery &query, Candid
     limits.reach_m += asked.detour_m;
     limits.goals = vague.data();
     limits.goal_count = static_cast<int32_t>(vague.size());
-    Search search(graph, limits, wide);
+    Search search(graph, limits, wide, absent);
     for (const int32_t row : search.run(query.reference)) {
       const Reached &chain = wide[static_cast<size_t>(row)];
       if (std::binary_search(vague.begin(), vague.end(), chain.node))
@@ -438,9 +445,12 @@ void find_candidates(const GraphView &graph, const CandidateQuery &query, Candid
     });
   }
   found.node_from_live.reserve(16 * chains.size());
-  for (const Reached *chain : chains)
-    if (!is_own_recent(query, chain->node))
+  for (const Reached *chain : chains) {
+    if (graph.first_half[chain->node] == not_loaded)
+      absent.push_back(chain->node);
+    else if (!is_own_recent(query, chain->node))
       add_candidate(query, *chain, found);
+  }
 }
 
 } // namespace engram::ENGRAM_ISA

@@ -14,7 +14,10 @@
 namespace engram {
 
 // Forward star: edge e has the half edges 2e (from a to b) and 2e + 1 (from b to a). The half edges
-// that leave a node are a list: first_half[node], then next_half[half], until -1.
+// that leave a node are a list: first_half[node], then next_half[half], until -1. Those of a node that
+// has not been loaded are `not_loaded`.
+constexpr int32_t not_loaded = -2;
+
 struct GraphView {
   int64_t node_count, edge_count;
   const int32_t *first_half; // (nodes)
@@ -93,8 +96,11 @@ ENGRAM_DECLARE_KERNELS(
 
     // Every node within the limits, in the order in which the search settles them: least uncertain
     // first, ties by node index. Throws std::invalid_argument when the arrays are inconsistent.
+    // `absent` are the nodes that it would have to go through and that have not been loaded: with any,
+    // the result is not to be used.
     void search_chains(const GraphView &graph, int32_t root, const SearchLimits &limits,
-                       std::vector<Reached> &reached);
+                       std::vector<Reached> &reached, std::vector<int32_t> &absent);
 
-    // The candidates near the live camera.
-    void find_candidates(const GraphView &graph, const CandidateQuery &query, Candidates &found);)
+    // The candidates near the live camera, and likewise the absent nodes.
+    void find_candidates(const GraphView &graph, const CandidateQuery &query, Candidates &found,
+                         std::vector<int32_t> &absent);)

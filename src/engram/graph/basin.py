@@ -97,6 +97,10 @@ class BasinCounts:
         zeros = np.zeros((2, BIN_COUNT), dtype=np.int64)
         return BasinCounts(zeros, zeros)
 
+    def __add__(self, other: BasinCounts) -> BasinCounts:
+        """Those of other drives counted, too."""
+        return BasinCounts(self.attempts + other.attempts, self.successes + other.successes)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchBasin:

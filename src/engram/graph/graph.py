@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
@@ -65,16 +66,16 @@ class EdgeTable(Sequence[Edge]):
 
 
 class EdgeRecords(Sequence[Edge]):
-    """The edges of a graph: those of one table, made on first use and kept, and later ones."""
+    """The edges of a graph: those of tables, made on first use and kept, and others."""
 
     def __init__(self) -> None:
-        self._table: Sequence[Edge] = ()
+        self._tables: list[tuple[int, EdgeTable]] = []
         self._known: list[Edge | None] = []
 
-    def begin_with(self, table: EdgeTable) -> None:
-        """Takes the edges of a table; there are no others yet."""
-        assert not self._known
-        self._table, self._known = table, [None] * len(table)
+    def add_table(self, table: EdgeTable) -> None:
+        """Adds the edges of a table."""
+        self._tables.append((len(self._known), table))
+        self._known += [None] * len(table)
 
     def append(self, edge: Edge) -> None:
         """Adds an edge."""
@@ -99,8 +100,14 @@ class EdgeRecords(Sequence[Edge]):
             return [self[at] for at in range(*index.indices(len(self)))]
         known = self._known[index]
         if known is None:
-            known = self._known[index] = self._table[index]
+            index %= len(self._known)
+            first, table = self._tables[bisect_right(self._tables, index, key=_first) - 1]
+            known = self._known[index] = table[index - first]
         return known
+
+
+def _first(table: tuple[int, EdgeTable]) -> int:
+    return table[0]
 
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -115,9 +122,13 @@ class Column(Generic[Scalar]):
 
     __slots__ = ("_count", "_storage")
 
-    def __init__(self, dtype: type[Scalar], row_shape: tuple[int, ...] = ()) -> None:
-        self._storage: NDArray[Scalar] = np.zeros((16, *row_shape), dtype=dtype)
-        self._count = 0
+    def __init__(
+        self, dtype: type[Scalar], row_shape: tuple[int, ...] = (), *, count: int = 0
+    ) -> None:
+        # Zeros that nobody has written or read take no memory.
+        room = 16 if count == 0 else count + 2**16
+        self._storage: NDArray[Scalar] = np.zeros((room, *row_shape), dtype=dtype)
+        self._count = count
 
     def __len__(self) -> int:
         return self._count
@@ -126,6 +137,10 @@ class Column(Generic[Scalar]):
     def rows(self) -> NDArray[Scalar]:
         """All rows, (N, *row_shape)."""
         return self._storage[: self._count]
+
+    def clear(self) -> None:
+        """Removes all rows."""
+        self._count = 0
 
     def append(self, row: Any) -> None:
         """Add one row."""
@@ -226,19 +241,28 @@ class HalfEdges:
     Attributes:
         sources, targets: (H,) int32, dense indices.
         target_in_source: (H, 3) float64, metres: the target's camera centre in the source's frame.
-        of_edges: number of edges in the graph when these were taken.
     """
 
     sources: NDArray[np.int32]
     targets: NDArray[np.int32]
     target_in_source: NDArray[np.float64]
-    of_edges: int
+
+    @staticmethod
+    def between(ends: NDArray[np.int32], poses: NDArray[np.float64], reach_m: float) -> HalfEdges:
+        """Those of edges (E, 2) from a to b with poses (E, 12), of at most `reach_m`."""
+        b_in_a = poses[:, 9:]
+        a_in_b = -np.einsum("nij,ni->nj", poses[:, :9].reshape(-1, 3, 3), b_in_a)
+        short = np.linalg.norm(b_in_a, axis=1) <= reach_m
+        a, b = ends[short].T
+        return HalfEdges(
+            np.concatenate([a, b]),
+            np.concatenate([b, a]),
+            np.concatenate([b_in_a[short], a_in_b[short]]),
+        )
 
     def rows(self, rows: NDArray[np.bool_]) -> HalfEdges:
         """The half-edges selected by an (H,) bool mask."""
-        return HalfEdges(
-            self.sources[rows], self.targets[rows], self.target_in_source[rows], self.of_edges
-        )
+        return HalfEdges(self.sources[rows], self.targets[rows], self.target_in_source[rows])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -299,8 +323,6 @@ class ExperienceGraph:
         self._sessions: list[SessionId] = []
         self._session_index: dict[SessionId, int] = {}
         self._edges = EdgeRecords()
-        # Numbers by (a, b, kind); None until one is asked for after a table was read.
-        self._numbers: dict[tuple[int, int, EdgeKind], int] | None = {}
         self._kinds = Column(np.uint8)
         self._node_sessions = Column(np.int32)
         self._driven_m = Column(np.float64)
@@ -328,7 +350,7 @@ class ExperienceGraph:
         if known is not None:
             return known
         self._bound = None
-        index = len(self._nodes)
+        index = len(self)
         session = self._session_index.setdefault(node.session, len(self._sessions))
         if session == len(self._sessions):
             self._sessions.append(node.session)
@@ -386,9 +408,7 @@ class ExperienceGraph:
             if a == b:
                 raise InputError(f"an edge joins two nodes; both ends are {edge.a}")
         error_rows = edge_error_rows([(edge.a_from_b, edge.covariance) for edge in edges])
-        keys = [(a, b, edge.kind) for (a, b), edge in zip(ends, edges, strict=True)]
-        if len(edges) >= _BULK and len(set(keys).difference(self._edge_numbers())) == len(keys):
-            self._edge_numbers().update(zip(keys, range(len(self._edges), 2**31), strict=False))
+        if len(edges) >= _BULK and self._are_new(ends, edges):
             self._edges.extend(edges)
             poses = np.empty((len(edges), 12))
             poses[:, :9] = np.stack([edge.a_from_b.rotation for edge in edges]).reshape(-1, 9)
@@ -397,19 +417,45 @@ class ExperienceGraph:
             self._link_all(np.array(ends, np.int32), kinds, poses, error_rows)
             return
         for (a, b), edge, error_row in zip(ends, edges, error_rows, strict=True):
-            known = self._edge_numbers().get((a, b, edge.kind))
-            if known is None:
-                known = self._link(a, b, edge)
-            self._edges[known] = edge
-            self._a_from_b.rows[known, :9] = edge.a_from_b.rotation.ravel()
-            self._a_from_b.rows[known, 9:] = edge.a_from_b.translation
-            self._errors.rows[known] = error_row
+            known = self._numbers(a, b, edge.kind) or [self._link(a, b, edge)]
+            for number in known:
+                self._edges[number] = edge
+                self._a_from_b.rows[number, :9] = edge.a_from_b.rotation.ravel()
+                self._a_from_b.rows[number, 9:] = edge.a_from_b.translation
+                self._errors.rows[number] = error_row
+
+    def _are_new(self, ends: Sequence[tuple[int, int]], edges: Sequence[Edge]) -> bool:
+        """Whether none of these edges supersedes another one of them, or of the graph."""
+        keys = {(a, b, edge.kind) for (a, b), edge in zip(ends, edges, strict=True)}
+        known = self._edges
+        return len(keys) == len(edges) and not (known and any(self._numbers(*key) for key in keys))
+
+    def _numbers(self, a: int, b: int, kind: EdgeKind) -> list[int]:
+        """The indices in `edges` of the edge of this key, as its ends have them."""
+        number, kinds, targets = _KIND_NUMBER[kind], self._kinds.rows, self._target.rows
+        found = []
+        for source, target, side in ((a, b, 0), (b, a, 1)):
+            for half in self._halves(source):
+                if half % 2 == side and targets[half] == target and kinds[half // 2] == number:
+                    found.append(half // 2)
+                    break
+        return list(dict.fromkeys(found))
+
+    def _halves(self, node: int) -> Iterator[int]:
+        """The half edges of a node, newest key first."""
+        half = int(self._first_half.rows[node])
+        if half == _core.NOT_LOADED:
+            self._load(np.array([node], np.int32))
+            half = int(self._first_half.rows[node])
+        following = self._next_half.rows
+        while half >= 0:
+            yield half
+            half = int(following[half])
 
     def _link(self, a: int, b: int, edge: Edge) -> int:
         self._bound = None
         number = len(self._edges)
         self._edges.append(edge)
-        self._edge_numbers()[a, b, edge.kind] = number
         self._kinds.append(_KIND_NUMBER[edge.kind])
         self._a_from_b.append(0.0)
         self._errors.append(0.0)
@@ -438,17 +484,8 @@ class ExperienceGraph:
             node = table.nodes[int(table.ends[selfish[0], 0])].id
             raise InputError(f"an edge joins two nodes; both ends are {node}")
         error_rows = error_rows_of(table.poses, table.covariances)
-        self._edges.begin_with(table)
-        self._numbers = None
+        self._edges.add_table(table)
         self._link_all(table.ends, table.kinds, table.poses, error_rows)
-
-    def _edge_numbers(self) -> dict[tuple[int, int, EdgeKind], int]:
-        """The number of each (a, b, kind)."""
-        if self._numbers is None:
-            b, a = self.edge_ends.T.tolist()
-            kinds = [EDGE_KINDS[number] for number in self._kinds.rows.tolist()]
-            self._numbers = dict(zip(zip(a, b, kinds, strict=True), range(len(a)), strict=True))
-        return self._numbers
 
     def _link_all(
         self,
@@ -456,6 +493,7 @@ class ExperienceGraph:
         kinds: NDArray[np.uint8],
         poses: NDArray[np.float64],
         error_rows: NDArray[np.float64],
+        within: tuple[int, int] | None = None,
     ) -> None:
         """`_link` for many edges, all of whose keys are new: a map being read.
 
@@ -464,6 +502,7 @@ class ExperienceGraph:
             kinds: (E,), index into `EDGE_KINDS`.
             poses: (E, 12).
             error_rows: (E, 8).
+            within: only nodes from the first index up to the second get half edges; None for all.
         """
         self._bound = None
         first = len(self._kinds)
@@ -471,18 +510,26 @@ class ExperienceGraph:
         self._a_from_b.extend(poses)
         self._errors.extend(error_rows)
         sources = ends.ravel()  # of half 2e its a, of half 2e + 1 its b
-        order = np.argsort(sources, kind="stable")
+        if within is None:
+            order = np.argsort(sources, kind="stable")
+        else:
+            inside = np.flatnonzero((sources >= within[0]) & (sources < within[1]))
+            order = inside[np.argsort(sources[inside], kind="stable")]
         halves = (2 * first + order).astype(np.int32)
         new_source = np.ones(len(order), np.bool_)
         new_source[1:] = sources[order[1:]] != sources[order[:-1]]
         before = np.roll(halves, 1)
         before[new_source] = self._first_half.rows[sources[order[new_source]]]
-        next_half = np.empty_like(halves)
+        next_half = np.full(len(sources), -1, np.int32)
         next_half[order] = before
         self._next_half.extend(next_half)
         self._target.extend(np.ascontiguousarray(ends[:, ::-1]).ravel())
         last = np.roll(new_source, -1)
         self._first_half.rows[sources[order[last]]] = halves[last]
+        self._join_chains(ends, kinds)
+
+    def _join_chains(self, ends: NDArray[np.int32], kinds: NDArray[np.uint8]) -> None:
+        """Joins the experiences at the ends of odometry edges."""
         chained = ends[kinds == _KIND_NUMBER[EdgeKind.ODOMETRY]]
         sessions = self._node_sessions.rows[chained]
         for a, b in chained[sessions[:, 0] == sessions[:, 1]].tolist():
@@ -554,10 +601,12 @@ class ExperienceGraph:
 
     def sessions_of(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
         """(Y,) int32: the session numbers of nodes, given by (Y,) int32 dense indices."""
+        self._want(nodes)
         return self._node_sessions.rows.take(nodes)
 
     def uuid_words_of(self, nodes: NDArray[np.int32]) -> NDArray[np.uint64]:
         """(Y, 2) uint64: UUIDs of nodes, given by (Y,) int32 dense indices; high word first."""
+        self._want(nodes)
         return self._uuid_words.rows.take(nodes, 0)
 
     @property
@@ -570,10 +619,10 @@ class ExperienceGraph:
 
     def find_edge(self, a: NodeId, b: NodeId, kind: EdgeKind) -> Edge | None:
         """The edge of this key; None if there is none, or an end is not in the graph."""
-        if a not in self._index or b not in self._index:
+        if a not in self or b not in self:
             return None
-        number = self._edge_numbers().get((self._index[a], self._index[b], kind))
-        return None if number is None else self._edges[number]
+        numbers = self._numbers(self.index(a), self.index(b), kind)
+        return self._edges[numbers[0]] if numbers else None
 
     def components(self) -> NDArray[np.int32]:
         """(N,) int32: the connected component of each node, numbered from 0 by first node."""
@@ -600,40 +649,27 @@ class ExperienceGraph:
 
     def numbered_edges_of(self, node: int) -> list[tuple[Edge, int]]:
         """The edges at a node, newest key first, each with its index in `edges`."""
-        edges, following = [], self._next_half.rows
-        half = int(self._first_half.rows[node])
-        while half != -1:
-            edges.append((self._edges[half // 2], half // 2))
-            half = int(following[half])
-        return edges
+        return [(self._edges[half // 2], half // 2) for half in self._halves(node)]
 
     # -- searching
 
     def half_edges(self, reach_m: float) -> HalfEdges:
         """All edges both ways, between nodes at most `reach_m` apart."""
-        poses = self._a_from_b.rows
-        b_in_a = poses[:, 9:]
-        a_in_b = -np.einsum("nij,ni->nj", poses[:, :9].reshape(-1, 3, 3), b_in_a)
-        targets = self._target.rows  # of half 2e an edge's b, of half 2e + 1 its a
-        short = np.linalg.norm(b_in_a, axis=1) <= reach_m
-        b, a = targets[0::2][short], targets[1::2][short]
-        return HalfEdges(
-            np.concatenate([a, b]),
-            np.concatenate([b, a]),
-            np.concatenate([b_in_a[short], a_in_b[short]]),
-            len(self._edges),
-        )
+        return HalfEdges.between(self.edge_ends[:, ::-1], self._a_from_b.rows, reach_m)
+
+    @property
+    def edge_count(self) -> int:
+        """Number of edges: it shows whether `half_edges` would find others than before."""
+        return len(self._edges)
 
     def beside(self, node: int, reach_m: float) -> NDArray[np.int32]:
         """(K,) int32: nodes joined to a node by an edge of at most `reach_m`."""
         found: set[int] = set()
-        poses, targets, following = self._a_from_b.rows, self._target.rows, self._next_half.rows
-        half = int(self._first_half.rows[node])
-        while half >= 0:
+        poses, targets = self._a_from_b.rows, self._target.rows
+        for half in self._halves(node):
             b_in_a = poses[half // 2, 9:]
             if math.sqrt(b_in_a @ b_in_a) <= reach_m:
                 found.add(int(targets[half]))
-            half = int(following[half])
         return np.array(sorted(found), np.int32)
 
     def neighbourhood(
@@ -661,14 +697,18 @@ class ExperienceGraph:
             covariance: (6, 6) float64 of that pose, left perturbation, [translation, rotation].
             search: radius and gates.
         """
-        columns = _core.graph_candidates(
-            self._arrays(),
+        question = (
             reference,
             _pose_row(reference_from_live),
             _core.pivoted_error(np.ascontiguousarray(covariance)),
             self._limits(search),
         )
-        return Neighbourhood(*columns)
+        while True:
+            columns, absent = _core.graph_candidates(self._arrays(), *question)
+            if columns is not None:
+                return Neighbourhood(*columns)
+            assert absent is not None
+            self._load(absent)
 
     def _limits(self, search: Search) -> _core.CandidateLimits:
         limits, config = _core.CandidateLimits(), search.config
@@ -693,9 +733,15 @@ class ExperienceGraph:
             passage: which edges to use; None for all.
         """
         lists = () if passage is None else (passage.edges, passage.closed)
-        columns = _core.graph_chains(self._arrays(), root, np.array(goals, np.int32), *lists)
-        row_of = {int(node): row for row, node in enumerate(columns[0])}
-        return ChainTree(row_of, *columns)
+        while True:
+            columns, absent = _core.graph_chains(
+                self._arrays(), root, np.array(goals, np.int32), *lists
+            )
+            if columns is not None:
+                row_of = {int(node): row for row, node in enumerate(columns[0])}
+                return ChainTree(row_of, *columns)
+            assert absent is not None
+            self._load(absent)
 
     def predict(self, reference: int, node: int) -> tuple[SE3, NDArray[np.float64]] | None:
         """``reference_from_node`` and its (6, 6) covariance along the least uncertain chain.
@@ -707,6 +753,25 @@ class ExperienceGraph:
             return None
         pose = tree.pose(node)
         return pose, tree.error(node).pivoted(pose.translation).covariance()
+
+    # -- what a graph that is read by pages does besides (`engram.graph.pages`)
+
+    def holds(self, index: int) -> bool:
+        """Whether a dense index below the length belongs to a node."""
+        return 0 <= index < len(self)
+
+    def ids(self, first: int) -> Iterator[NodeId | None]:
+        """The nodes from a dense index on; None for one that belongs to no node."""
+        return (node.id for node in self._nodes[first:])
+
+    def trim(self) -> None:
+        """Gives back memory; only between two frames."""
+
+    def _want(self, nodes: NDArray[np.int32]) -> None:
+        """Brings nodes into memory."""
+
+    def _load(self, nodes: NDArray[np.int32]) -> None:
+        raise AssertionError(f"{nodes} are not in memory")
 
     def _arrays(self) -> _core.GraphArrays:
         if self._bound is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,34 @@ from engram.graph.basin import BIN_M, MatchBasin
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Attempt, NodeId, PathEntry, PathEntryKind, PathId
 from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.pages import PAGE
 
+ENTRY_KINDS = tuple(PathEntryKind)
 ALL_KINDS = frozenset(PathEntryKind)
 # [L15 §IV]'s text records matches only (method §4).
 MATCHES_ONLY = frozenset({PathEntryKind.MATCHED, PathEntryKind.REPLAYED})
+
+
+class PathPages(Protocol):
+    """Where a path memory reads which nodes are on which paths; its answers never change."""
+
+    @property
+    def paths(self) -> Sequence[PathId]:
+        """All paths by number."""
+        ...
+
+    def visits(
+        self, first: int, end: int
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.uint8]]:
+        """Nodes (V,), numbers of paths (V,) and kinds (V,), indices into `ENTRY_KINDS`.
+
+        Args:
+            first, end: dense indices of the first node and of that after the last.
+
+        Raises:
+            MapCorruptError: a row of these is damaged.
+        """
+        ...
 
 
 class PathMemory:
@@ -32,17 +56,26 @@ class PathMemory:
         graph: the graph that gives the dense indices.
         kinds: kinds of entry that count a node as on a path. Entries of other kinds are stored
             only.
+        pages: paths of a map, of which the bits of nodes are read when they are requested, and
+            entries are not held; None for a memory of what is added.
     """
 
     def __init__(
-        self, graph: ExperienceGraph, kinds: Collection[PathEntryKind] = ALL_KINDS
+        self,
+        graph: ExperienceGraph,
+        kinds: Collection[PathEntryKind] = ALL_KINDS,
+        pages: PathPages | None = None,
     ) -> None:
         self._graph = graph
         self.kinds = frozenset(kinds)
-        self._entries: list[list[PathEntry]] = []
-        self._paths: list[PathId] = []
-        self._number: dict[PathId, int] = {}
+        self._pages = pages
+        self._paths: list[PathId] = [] if pages is None else list(pages.paths)
+        self._entries: list[list[PathEntry]] = [[] for _ in self._paths]
+        self._number = {path: number for number, path in enumerate(self._paths)}
         self._bits = np.zeros((16, 1), dtype=np.uint64)
+        if pages is not None:  # zeros that nobody has written or read take no memory
+            self._bits = np.zeros((len(graph) + 2**16, len(self._paths) // 64 + 1), np.uint64)
+        self._read: set[int] = set()
         self._observed = _core.ObservedPaths()
         self._counting: dict[frozenset[PathEntryKind], PathMemory] = {}
         # Number of paths and the core's view of the bits; valid until they grow.
@@ -67,7 +100,7 @@ class PathMemory:
         if wanted == self.kinds:
             return self
         if wanted not in self._counting:
-            other = self._counting[wanted] = PathMemory(self._graph, wanted)
+            other = self._counting[wanted] = PathMemory(self._graph, wanted, self._pages)
             for entries in self._entries:
                 for entry in entries:
                     other.add(entry)
@@ -82,7 +115,7 @@ class PathMemory:
         node = self._graph.index(entry.node)
         number = self._numbered(entry.path)
         if _insert(self._entries[number], entry) and entry.kind in self.kinds:
-            self._make_room()
+            self._want(np.array([node], np.int32))
             self._bits[node, number // 64] |= np.uint64(1 << (number % 64))
             self._observed.add(node, number)
         for other in self._counting.values():
@@ -90,7 +123,7 @@ class PathMemory:
 
     def add_all(self, entries: Sequence[PathEntry]) -> None:
         """Add many entries, in this order; see `add`."""
-        if self._counting:
+        if self._counting or self._pages is not None:
             for entry in entries:
                 self.add(entry)
             return
@@ -103,9 +136,7 @@ class PathMemory:
                 numbers.append(number)
                 self._observed.add(node, number)
         self._make_room()
-        at, bits = np.array(numbers, np.int64), np.uint64(1)
-        words = bits << (at % 64).astype(np.uint64)
-        np.bitwise_or.at(self._bits, (np.array(nodes, np.int64), at // 64), words)
+        self._set_bits(np.array(nodes, np.int64), np.array(numbers, np.int64))
 
     def on_paths(self, paths: Sequence[PathId], nodes: NDArray[np.int32]) -> NDArray[np.bool_]:
         """(P, N) bool: whether each path holds each node; unknown paths hold none.
@@ -114,7 +145,7 @@ class PathMemory:
             paths: P paths.
             nodes: (N,) int32, dense node indices.
         """
-        self._make_room()
+        self._want(nodes)
         numbers = np.array([self._number.get(path, -1) for path in paths], np.int64)
         words = self._bits[nodes][:, numbers // 64].T
         held = (words >> (numbers % 64).astype(np.uint64)[:, None]) & np.uint64(1)
@@ -130,6 +161,7 @@ class PathMemory:
             b: (B,) int32, dense node indices.
             excluded: a path that does not count, such as the live session's own.
         """
+        self._want(a, b)
         return _core.co_occurrence(self._bound(), a, b, self._excluded(excluded))
 
     def evidence(
@@ -152,6 +184,7 @@ class PathMemory:
             alpha: pseudo-count of the likelihood.
             gamma: pseudo-count of the prior.
         """
+        self._want(observed, np.array([] if reference is None else [reference], np.int32))
         return _core.PathEvidence(
             observed,
             outcomes,
@@ -175,6 +208,7 @@ class PathMemory:
             candidates: (Y,) int32, dense node indices.
             evidence: made by this path memory.
         """
+        self._want(candidates)
         return _core.path_scores(self._observed, self._bound(), candidates, evidence)
 
     def order(
@@ -194,6 +228,7 @@ class PathMemory:
             basin: gives g.
             level: threshold of g.
         """
+        self._want(neighbourhood.nodes)
         candidates = _core.PathCandidates(
             neighbourhood.nodes,
             neighbourhood.along_m,
@@ -212,6 +247,22 @@ class PathMemory:
             self._paths.append(path)
             self._entries.append([])
         return number
+
+    def _want(self, *nodes: NDArray[np.int32]) -> None:
+        """Brings the bits of nodes into memory."""
+        self._make_room()
+        if self._pages is None:
+            return
+        for page in np.unique(np.concatenate(nodes) // PAGE).tolist():
+            if page not in self._read:
+                self._read.add(page)
+                on, paths, kinds = self._pages.visits(page * PAGE, (page + 1) * PAGE)
+                counts = np.array([kind in self.kinds for kind in ENTRY_KINDS])[kinds]
+                self._set_bits(on[counts], paths[counts].astype(np.int64))
+
+    def _set_bits(self, nodes: NDArray[np.integer], numbers: NDArray[np.int64]) -> None:
+        bits = np.uint64(1) << (numbers % 64).astype(np.uint64)
+        np.bitwise_or.at(self._bits, (nodes, numbers // 64), bits)
 
     def _bound(self) -> _core.PathBits:
         self._make_room()
@@ -406,6 +457,24 @@ class Attempts:
             policy[self.policy],
         ]
         return np.stack(columns, axis=1, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """How past drives fared with the nodes of a map in a range of dense indices.
+
+    Attributes:
+        nodes: (n,) int32, dense indices, rising.
+        driven_m: (n,) float64, metres.
+        links: (L, 2) int32, rows of the nodes that an odometry edge of one drive joins.
+        good, bad: (n,) float64, successes and weighted failures.
+    """
+
+    nodes: NDArray[np.int32]
+    driven_m: NDArray[np.float64]
+    links: NDArray[np.int32]
+    good: NDArray[np.float64]
+    bad: NDArray[np.float64]
 
 
 _COLUMNS = tuple(one.name for one in fields(Attempts) if one.name != "policies")

@@ -352,6 +352,7 @@ class Localiser:
             result_sink: decides whether places beyond the neighbourhood may be tried.
         """
         clock = clock or StageClock()
+        self._graph.trim()
         self._new_damaged, self._near, self._looked_up, self._beyond = (), None, False, []
         self._history.begin_frame(self._driven_m)
         self._fixes.begin_frame(self._motion.odometry.inliers)

@@ -71,6 +71,7 @@ class PlaceBelief:
         self.config = config or BeliefConfig()
         self._graph = graph
         self._steps: HalfEdges | None = None
+        self._of_edges = 0
         self.forget()
 
     def forget(self) -> None:
@@ -139,8 +140,9 @@ class PlaceBelief:
 
     def _edges(self) -> HalfEdges:
         """Edges short enough to be steps, between nodes that the belief covers."""
-        if self._steps is None or self._steps.of_edges != len(self._graph.edges):
+        if self._steps is None or self._of_edges != self._graph.edge_count:
             self._steps = self._graph.half_edges(self.config.reach_m)
+            self._of_edges = self._graph.edge_count
         known = len(self._belief)
         rows = (self._steps.sources < known) & (self._steps.targets < known)
         return self._steps if rows.all() else self._steps.rows(rows)
@@ -219,7 +221,7 @@ class Exhaustive:
             self._order, self._next = van_der_corput_order(len(self._graph)), 0
         proposed = self._order[self._next : self._next + count]
         self._next += len(proposed)
-        return [index for index in proposed if allowed(index)]
+        return [index for index in proposed if self._graph.holds(index) and allowed(index)]
 
     def carry_on(self, motion: SE3 | None) -> None:
         """See `Relocaliser`; has no effect."""

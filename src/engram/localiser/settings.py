@@ -18,7 +18,7 @@ from engram.graph.model import PathEntryKind
 from engram.graph.paths import ALL_KINDS, MATCHES_ONLY
 from engram.localiser.acceptance import AcceptanceConfig
 from engram.localiser.yardstick import LookalikeConfig
-from engram.ranking.context import LessonsConfig
+from engram.ranking.lessons import LessonsConfig
 from engram.ranking.recent import RecentConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not

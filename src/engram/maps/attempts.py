@@ -10,20 +10,20 @@ hash. A missing or damaged row only costs the time to compute it again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, bindparam, select
 
 from engram.errors import InputError, MapCorruptError
 from engram.graph.model import NodeId
 from engram.graph.paths import Attempts
 from engram.maps.rows import Row, node_from_bytes, sealed, verified
 from engram.maps.schema import nodes, words
-from engram.maps.sqlite import upsert
+from engram.maps.sqlite import SqliteDatabase, upsert
 
 _VERSION = 1
 _PACKED = np.dtype(
@@ -231,17 +231,33 @@ def write_words(connection: Connection, rows: list[Row]) -> None:
 
 def load_words(connection: Connection, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
     """Words (n,) of each node by the vocabulary of this hash (16 bytes), without damaged rows."""
-    query = (
-        select(*words.columns, nodes.c.uuid)
-        .select_from(words.join(nodes, nodes.c.key == words.c.node))
-        .where(words.c.vocabulary == vocabulary)
-        .order_by(words.c.node)
-    )
+    query = _WORDS.where(words.c.vocabulary == vocabulary).order_by(words.c.node)
     found = {}
     for row in connection.execute(query):
-        try:
-            kept = next(verified(words, [row]))
-            found[node_from_bytes(row[-1])] = decode_words(kept["body"])
-        except (MapCorruptError, ValueError):
-            continue  # computed again later; `engram check` names the row
+        sound = _sound_words(row)
+        if sound is not None:
+            found[node_from_bytes(row[-1])] = sound
     return found
+
+
+def words_of_node(
+    database: SqliteDatabase, node: NodeId, vocabulary: bytes
+) -> NDArray[np.int32] | None:
+    """The words (n,) of a node by the vocabulary of this hash; None without sound ones."""
+    row = database.first(_WORDS_OF_NODE, {"uuid": node.bytes, "vocabulary": vocabulary})
+    return None if row is None else _sound_words(row)
+
+
+def _sound_words(row: Sequence[Any]) -> NDArray[np.int32] | None:
+    try:
+        return decode_words(next(verified(words, [row]))["body"])
+    except (MapCorruptError, ValueError):
+        return None  # computed again later; `engram check` names the row
+
+
+_WORDS = select(*words.columns, nodes.c.uuid).select_from(
+    words.join(nodes, nodes.c.key == words.c.node)
+)
+_WORDS_OF_NODE = _WORDS.where(
+    nodes.c.uuid == bindparam("uuid"), words.c.vocabulary == bindparam("vocabulary")
+)

@@ -33,11 +33,12 @@ from engram.graph.model import (
     Session,
     SessionId,
 )
+from engram.graph.pages import PagedGraph
 from engram.graph.paths import Attempts, PathMemory
 from engram.graph.placing import PlacingConfig
 from engram.keywords import keywords
 from engram.maps import marks, reading
-from engram.maps.attempts import load_words, words_row, write_words
+from engram.maps.attempts import load_words, words_of_node, words_row, write_words
 from engram.maps.checking import check
 from engram.maps.content import content_hash, record_hashes, verified_hash
 from engram.maps.difference import STRETCH_M, MapDifference, difference
@@ -46,6 +47,7 @@ from engram.maps.hiding import Reverted, compare, hide_revision
 from engram.maps.laying_out import new_places
 from engram.maps.map_frame import MapFrame, all_places, frame_of, graph_of
 from engram.maps.origins import Origin, origin_of
+from engram.maps.pages import MapPages
 from engram.maps.records import (
     CheckReport,
     InterruptedSession,
@@ -338,6 +340,18 @@ class Map:
         """Its experience graph."""
         return self._read_contents().graph
 
+    def read_graph(self) -> ExperienceGraph:
+        """A graph that reads its nodes and edges by pages, as searches come to them.
+
+        Dense indices are in the order of saving, and the same in each such graph of this revision.
+        """
+        return PagedGraph(self.pages)
+
+    @property
+    def pages(self) -> MapPages:
+        """What graphs, paths and lessons are read from by pages."""
+        return self.derived(_pages_of, self.revision)
+
     @property
     def path_memory(self) -> PathMemory:
         """Its paths."""
@@ -433,6 +447,10 @@ class Map:
         """
         with self._database.reading() as connection:
             return load_words(connection, vocabulary)
+
+    def words_of(self, node: NodeId, vocabulary: bytes) -> NDArray[np.int32] | None:
+        """The stored words (n,) of a node, as `words`; None without sound ones."""
+        return words_of_node(self._database, node, vocabulary)
 
     def derived(
         self, make: Callable[Concatenate[Self, _P], _T], *args: _P.args, **kwargs: _P.kwargs
@@ -1044,6 +1062,11 @@ _KEPT = tuple(name for name, one in vars(Map).items() if isinstance(one, cached_
 
 class _DryRunError(Exception):
     """Ends a transaction without committing it."""
+
+
+def _pages_of(opened: Map, revision: int) -> MapPages:
+    del revision  # it tells these pages from those of another one
+    return MapPages(opened._database, opened._view)
 
 
 @keywords()

@@ -160,14 +160,15 @@ class MapFrame:
             _DEGREE_M * float(np.cos(np.deg2rad(self.origin[0])))
         )
 
-    def near(self, latitude_deg: float, longitude_deg: float, within_m: float) -> list[int]:
-        """Nodes near a place on earth, by dense index, nearest first; none without anchors."""
+    def near(self, latitude_deg: float, longitude_deg: float, within_m: float) -> list[NodeId]:
+        """Nodes near a place on earth, nearest first; none without anchors."""
         if self.origin is None:
             return []
         here = local_m(np.array([latitude_deg]), np.array([longitude_deg]), self.origin)[0]
         away_m = np.linalg.norm(self.positions[:, :2] - here, axis=1)
         order = np.argsort(away_m, kind="stable")
-        return [int(at) for at in order[: int((away_m <= within_m).sum())]]
+        near = order[: int((away_m <= within_m).sum())]
+        return [self._graph.node(at).id for at in near.tolist()]
 
 
 def local_m(

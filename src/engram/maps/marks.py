@@ -20,7 +20,7 @@ from engram.graph.model import (
     Removal,
     same_measurement,
 )
-from engram.maps.columns import read_columns
+from engram.maps.columns import Columns, read_columns
 from engram.maps.rows import (
     Row,
     checked_int,
@@ -173,6 +173,26 @@ def is_removed(row: Row, removed: list[tuple[int, SE3]]) -> bool:
     a_from_b = transform_from_bytes(row["a_from_b"], f"edge {row['key']}")
     inverse = a_from_b.inverse()
     return any(same_measurement(was, a_from_b if a == row["a"] else inverse) for a, was in removed)
+
+
+def without_removed(
+    removed: dict[tuple[frozenset[int], str], list[tuple[int, SE3]]], found: Columns
+) -> Columns:
+    """The edges without those that were removed; hardly any map has some."""
+    if not removed:
+        return found
+    codes, texts = found.texts["kind"]
+    kept = []
+    for at, (key, a, b, code) in enumerate(
+        zip(*(found[name].tolist() for name in ("key", "a", "b")), codes.tolist(), strict=True)
+    ):
+        row = {"key": key, "a": a, "b": b, "kind": texts[code]}
+        measured = removed.get(edge_key(row))
+        if measured is None or not is_removed(
+            {**row, "a_from_b": found["a_from_b"][at].tobytes()}, measured
+        ):
+            kept.append(at)
+    return found.rows(np.array(kept, np.intp))
 
 
 def _node_ids(connection: Connection, keys: set[int]) -> dict[int, NodeId]:

@@ -31,7 +31,7 @@ from engram.graph.model import (
 from engram.graph.paths import Attempts
 from engram.maps.attempts import unpack
 from engram.maps.columns import Columns, read_columns
-from engram.maps.marks import edge_key, is_removed, removed_measurements
+from engram.maps.marks import removed_measurements, without_removed
 from engram.maps.records import MapContents, Revision
 from engram.maps.rows import (
     Row,
@@ -78,7 +78,7 @@ def load(connection: Connection, view: View) -> MapContents:
         MapCorruptError: a row does not match its checksum or points at nothing.
     """
     known_cameras = load_cameras(connection)
-    session_by_key = _sessions(connection, view, known_cameras)
+    session_by_key = sessions_by_key(connection, view, known_cameras)
     session_ids = {key: one.id for key, one in session_by_key.items()}
     node_keys, node_list = _nodes(connection, view, known_cameras, session_ids)
     used = {one.camera for one in session_by_key.values()} | {one.camera for one in node_list}
@@ -94,16 +94,16 @@ def load(connection: Connection, view: View) -> MapContents:
 
 def load_sessions(connection: Connection, view: View) -> tuple[Session, ...]:
     """The drives of the map."""
-    return tuple(_sessions(connection, view, load_cameras(connection)).values())
+    return tuple(sessions_by_key(connection, view, load_cameras(connection)).values())
 
 
 def load_amendments(connection: Connection, view: View) -> tuple[Amendment, ...]:
     """Amendments of the visible sessions; the last of contradicting ones counts."""
-    known = _sessions(connection, view, load_cameras(connection))
+    known = sessions_by_key(connection, view, load_cameras(connection))
     return tuple(one for _, one in _amendments(connection, view, known))
 
 
-def _sessions(
+def sessions_by_key(
     connection: Connection, view: View, known_cameras: dict[int, StereoCamera]
 ) -> dict[int, Session]:
     """Sessions by key, with their amendments applied."""
@@ -356,7 +356,7 @@ def _edges(
     """Edges between visible nodes: those of hidden nodes are hidden with them."""
     sizes = {"a_from_b": 96, "covariance": 168}
     found = read_columns(connection, view, edges, sizes).newest("a", "b", "kind")
-    found = _without_removed(connection, view, found)
+    found = without_removed(removed_measurements(connection, view), found)
     (a, a_seen), (b, b_seen) = (_dense(found[end], node_keys) for end in ("a", "b"))
     seen = np.flatnonzero(a_seen & b_seen)
     found, ends = found.rows(seen), np.column_stack([a, b])[seen]
@@ -368,25 +368,6 @@ def _edges(
         np.array(numbers, np.uint8)[codes],
         *edge_arrays(found["a_from_b"], found["covariance"], found["key"]),
     )
-
-
-def _without_removed(connection: Connection, view: View, found: Columns) -> Columns:
-    """The edges without those that were removed; hardly any map has some."""
-    removed = removed_measurements(connection, view)
-    if not removed:
-        return found
-    codes, texts = found.texts["kind"]
-    kept = []
-    for at, (key, a, b, code) in enumerate(
-        zip(*(found[name].tolist() for name in ("key", "a", "b")), codes.tolist(), strict=True)
-    ):
-        row = {"key": key, "a": a, "b": b, "kind": texts[code]}
-        measured = removed.get(edge_key(row))
-        if measured is None or not is_removed(
-            {**row, "a_from_b": found["a_from_b"][at].tobytes()}, measured
-        ):
-            kept.append(at)
-    return found.rows(np.array(kept, np.intp))
 
 
 def _path_entries(

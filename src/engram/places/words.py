@@ -84,7 +84,7 @@ class NodeWords:
         self._frames = frames
         self._give_vocabulary = vocabulary
         self._store = store
-        self._worked_out: dict[NodeId, Words | None] = {}
+        self._known: dict[NodeId, Words | None] = {}
         # The live frame's words: several localisers of one drive ask for them in turn.
         self._last: tuple[Frame, Words] | None = None
 
@@ -108,8 +108,15 @@ class NodeWords:
         """The valid words that the map stores for this vocabulary."""
         if self._store is None:
             return {}
-        kept, most = self._store.words(self.hash), len(self.vocabulary)
-        return {node: words for node, words in kept.items() if not len(words) or words[-1] < most}
+        kept = self._store.words(self.hash)
+        return {node: words for node, words in kept.items() if self._fit(words)}
+
+    def _stored(self, node: NodeId) -> Words | None:
+        words = None if self._store is None else self._store.words_of(node, self.hash)
+        return words if words is not None and self._fit(words) else None
+
+    def _fit(self, words: Words) -> bool:
+        return not len(words) or int(words[-1]) < len(self.vocabulary)
 
     @cached_property
     def idf(self) -> NDArray[np.float64]:
@@ -117,8 +124,8 @@ class NodeWords:
         return inverse_frequencies(self.vocabulary.statistics)
 
     def prepare(self) -> None:
-        """Reads the vocabulary and the stored words now instead of during a drive."""
-        _ = self.idf, self.kept
+        """Reads the vocabulary now instead of during a drive."""
+        _ = self.idf
 
     def of_frame(self, frame: Frame) -> Words:
         """The words (n,) int32 of a frame."""
@@ -133,10 +140,12 @@ class NodeWords:
 
         ``engram check`` reports such a node, and reading its landmarks raises.
         """
-        words = self.kept.get(node)
-        if words is None and node not in self._worked_out:
-            self._worked_out[node] = self._work_out(node)
-        return self._worked_out[node] if words is None else words
+        if "kept" in self.__dict__ and (words := self.kept.get(node)) is not None:
+            return words
+        if node not in self._known:
+            words = self._stored(node)
+            self._known[node] = self._work_out(node) if words is None else words
+        return self._known[node]
 
     def keep_missing(self, nodes: Sequence[NodeId], monitor: Monitor = QUIET) -> int:
         """Computes the missing words of nodes and stores them in the map.
@@ -193,8 +202,8 @@ class PlaceBook:
     Only the thread of the graph calls `learn_new_nodes`; any thread may compare.
 
     Attributes:
-        unreadable: nodes, by dense index, with damaged landmarks: they have no words here, and
-            must not be proposed.
+        unreadable: dense indices of nodes with damaged landmarks, and of none: they have no words
+            here, and must not be proposed.
     """
 
     def __init__(
@@ -208,7 +217,6 @@ class PlaceBook:
         self._words = words
         self._recogniser = recogniser(words.vocabulary)
         self._lock = Lock()
-        self.learn_new_nodes()
 
     def __len__(self) -> int:
         """Number of known nodes; place numbers are dense indices of the graph."""
@@ -221,9 +229,11 @@ class PlaceBook:
         return self._words.of_frame(frame)
 
     def learn_new_nodes(self) -> None:
-        """Adds the new nodes of the graph."""
-        for index in range(len(self._recogniser), len(self._graph)):
-            words = self._words_of_node(self._graph.node(index).id)
+        """Adds the new nodes of the graph; at first, all."""
+        if not len(self):
+            _ = self._words.kept  # read at once
+        for index, node in enumerate(self._graph.ids(len(self)), len(self)):
+            words = None if node is None else self._words_of_node(node)
             if words is None:  # relocalisation works without it
                 self.unreadable.add(index)
                 words = np.zeros(0, np.int32)

@@ -2,164 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram import _core
-from engram.config import check_bounds
 from engram.geometry.cameras import CameraId, StereoCamera
 from engram.graph.basin import MatchBasin
 from engram.graph.graph import ExperienceGraph
-from engram.graph.model import PathId, Session, SessionId, path_id
+from engram.graph.model import PathId, Session, SessionId
 from engram.graph.neighbourhood import Neighbourhood
-from engram.graph.paths import Attempts, PathMemory
+from engram.graph.paths import PathMemory
 from engram.places.words import NodeWords
+from engram.ranking.lessons import Lessons, PagedLessons
 from engram.ranking.recent import Observations, RunAttempts
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
-
-
-# Match probability of a node without evidence.
-UNKNOWN_BASE = 0.4
-
-
-@dataclass(frozen=True, slots=True)
-class LessonsConfig:
-    """How past drives' attempts count for a node. Source: `lab/reports/ranking-policies.md`."""
-
-    pool_m: Annotated[
-        float,
-        Meta(
-            gt=0,
-            description="m along the drive over which evidence of another node of the experience "
-            "decays e-fold: nodes are a metre apart, and a drive attempts some of them",
-        ),
-    ] = 3.0
-    pool_reach_m: Annotated[float, Meta(ge=0, description="m at which that evidence ends")] = 4.0
-    pool_nodes: Annotated[
-        int, Meta(ge=0, description="most nodes before and after that share their evidence")
-    ] = 8
-    saving_counts: Annotated[
-        float,
-        Meta(
-            ge=0,
-            description="successes counted for the drive that saved a node, which would surely "
-            "have matched it",
-        ),
-    ] = 2.0
-    unknown_base: Annotated[
-        float, Meta(gt=0, lt=1, description="match probability of a node without evidence")
-    ] = UNKNOWN_BASE
-    base_attempts: Annotated[
-        float, Meta(gt=0, description="weight of that probability, in attempts")
-    ] = 2.0
-
-    def __post_init__(self) -> None:
-        check_bounds(self)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Lessons:
-    """Probability that each node matches if its offset does not prevent it.
-
-    Attributes:
-        base: (N,) float64, that probability by all past drives; without nodes saved since the
-            map was opened.
-    """
-
-    base: NDArray[np.float64]
-    unknown: float = UNKNOWN_BASE
-    _log_odds: NDArray[np.float64] = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        base = np.append(self.base, self.unknown)
-        object.__setattr__(self, "_log_odds", np.log(base / (1 - base)))
-
-    @staticmethod
-    def none() -> Lessons:
-        """Lessons of an empty map."""
-        return Lessons(np.zeros(0))
-
-    def log_odds_of(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(Y,) float64: log odds of the probabilities of nodes, (Y,) dense indices."""
-        return self._log_odds[np.minimum(nodes, len(self.base))]
-
-    @staticmethod
-    def learnt(
-        graph: ExperienceGraph,
-        path_memory: PathMemory,
-        viewers: Sequence[PathId],
-        attempts: Attempts,
-        rates: NDArray[np.float64],
-        config: LessonsConfig = LessonsConfig(),
-    ) -> Lessons:
-        """Learns from the drives of a map.
-
-        A success counts 1, a failure as much as its success rate g. A drive without remembered
-        attempts counts as having matched the nodes on its path. Evidence is shared along an
-        experience, as nodes a metre apart match alike.
-
-        Args:
-            viewers: V drives, by their paths.
-            attempts: their attempts; `session` indexes `viewers`.
-            rates: (A,) float64, success rate g at the predicted offset of each attempt.
-            config: how they count.
-        """
-        sharing = _sharing(graph, config)
-        good, bad = _counts(graph, path_memory, viewers, attempts, rates)
-        known = set(viewers)
-        saved = [path_id(graph.session(number)) in known for number in range(graph.session_count)]
-        good += config.saving_counts * np.array(saved, np.bool_)[graph.sessions]
-        good, bad = sharing @ good, sharing @ bad
-        prior, unknown = config.base_attempts, config.unknown_base
-        return Lessons((good + prior * unknown) / (good + bad + prior), unknown)
-
-
-def _counts(
-    graph: ExperienceGraph,
-    path_memory: PathMemory,
-    viewers: Sequence[PathId],
-    attempts: Attempts,
-    rates: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(N,) float64 each: successes and weighted failures of each node."""
-    count = len(graph)
-    good, bad = np.zeros((2, count))
-    np.add.at(good, attempts.node, attempts.accepted)
-    np.add.at(bad, attempts.node, np.where(attempts.accepted, 0.0, rates))
-    spoke = set(np.unique(attempts.session).tolist())
-    silent = [viewer for number, viewer in enumerate(viewers) if number not in spoke]
-    walked = [graph.index(one.node) for path in silent for one in path_memory.entries(path)]
-    np.add.at(good, np.array(walked, np.int64), 1.0)
-    return good, bad
-
-
-def _sharing(graph: ExperienceGraph, config: LessonsConfig) -> csr_matrix:
-    """(N, N) weight of each node's evidence at the other nodes of its experience."""
-    from scipy.sparse import coo_matrix
-
-    count = len(graph)
-    driven_m, experiences = graph.driven_m, graph.experiences
-    in_line = np.lexsort((np.arange(count), driven_m, experiences))
-    rows, columns, weights = [np.arange(count)], [np.arange(count)], [np.ones(count)]
-    for step in range(1, config.pool_nodes + 1):
-        a, b = in_line[:-step], in_line[step:]
-        apart_m = driven_m[b] - driven_m[a]
-        near = (experiences[a] == experiences[b]) & (apart_m <= config.pool_reach_m)
-        if not near.any():
-            break
-        weight = np.exp(-apart_m[near] / config.pool_m)
-        rows += [a[near], b[near]]
-        columns += [b[near], a[near]]
-        weights += [weight, weight]
-    at = (np.concatenate(rows), np.concatenate(columns))
-    return coo_matrix((np.concatenate(weights), at), (count, count)).tocsr()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,7 +33,7 @@ class Background:
     """
 
     sessions: Mapping[SessionId, Session] = field(default_factory=dict)
-    lessons: Lessons = field(default_factory=Lessons.none)
+    lessons: Lessons | PagedLessons = field(default_factory=Lessons.none)
     words: NodeWords | None = None
     cameras: Mapping[CameraId, StereoCamera] = field(default_factory=dict)
 

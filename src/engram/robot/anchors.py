@@ -35,7 +35,7 @@ from engram.mapper.loops import edges_agree
 from engram.maps.map import Map
 from engram.maps.map_frame import FARTHEST_M, ORIGIN, MapFrame, Moves, changed, local_m, moves
 from engram.monitor import QUIET, Monitor
-from engram.robot.localisers import DriveSequence, relocaliser_in
+from engram.robot.localisers import DriveSequence, graph_in, relocaliser_in
 from engram.robot.settings import Settings
 from engram.sequences.bags.bag_sequence import BagSequence
 from engram.sequences.bags.containers import is_bag
@@ -294,7 +294,12 @@ class ReceiverFix:
 
 
 def relocaliser_with_fixes(
-    opened: Map, sequence: DriveSequence, settings: Settings, name: str | None
+    opened: Map,
+    sequence: DriveSequence,
+    settings: Settings,
+    name: str | None,
+    *,
+    saves: bool = False,
 ) -> str | Relocaliser | None:
     """The relocaliser of a drive, which also proposes nodes near its satellite fixes.
 
@@ -303,6 +308,7 @@ def relocaliser_with_fixes(
         sequence: the drive; only bags hold fixes.
         settings: `localiser.fix_sigmas` says how far from a fix nodes are proposed.
         name: key of `RELOCALISERS`; None for none.
+        saves: see `LocaliserParts`.
 
     Returns:
         `name`, if there are no fixes to use.
@@ -310,11 +316,18 @@ def relocaliser_with_fixes(
     if not isinstance(sequence, BagSequence) or not settings.localiser.fix_sigmas:
         return name
     fixes = sequence.fixes()
-    return name if fixes is None else suggesting(opened, LatestFix(fixes), settings, name)
+    return (
+        name if fixes is None else suggesting(opened, LatestFix(fixes), settings, name, saves=saves)
+    )
 
 
 def suggesting(
-    opened: Map, latest: Callable[[int], Fix | None], settings: Settings, name: str | None
+    opened: Map,
+    latest: Callable[[int], Fix | None],
+    settings: Settings,
+    name: str | None,
+    *,
+    saves: bool = False,
 ) -> str | Relocaliser | None:
     """A relocaliser that also proposes nodes near a receiver's newest fix.
 
@@ -323,6 +336,7 @@ def suggesting(
         latest: the newest fix at a time, ns; None without one.
         settings: `localiser.fix_sigmas` says how far from a fix nodes are proposed.
         name: key of `RELOCALISERS`; None for none.
+        saves: see `LocaliserParts`.
 
     Returns:
         `name`, if fixes are not to be used.
@@ -330,17 +344,19 @@ def suggesting(
     sigmas = settings.localiser.fix_sigmas
     if not sigmas or opened.frame.origin is None:
         return name
-    inner = None if name is None else relocaliser_in(opened, name, settings.frontend.descriptor)
-    return Suggested(inner, nodes_near(opened, latest, sigmas))
+    graph, descriptor = graph_in(opened, saves=saves), settings.frontend.descriptor
+    inner = None if name is None else relocaliser_in(opened, name, descriptor, graph)
+    return Suggested(inner, nodes_near(opened, graph, latest, sigmas))
 
 
 def nodes_near(
-    opened: Map, latest: Callable[[int], Fix | None], sigmas: float
+    opened: Map, graph: ExperienceGraph, latest: Callable[[int], Fix | None], sigmas: float
 ) -> Callable[[Frame], list[int]]:
     """The nodes near the newest fix, for `Suggested`.
 
     Args:
         opened: the map, anchored to the earth.
+        graph: gives the dense indices of the nodes.
         latest: the newest fix at a time, ns; None without one.
         sigmas: how far from a fix, in its standard deviations.
     """
@@ -351,7 +367,8 @@ def nodes_near(
         if fix is None:
             return []
         within_m = sigmas * (fix.sigma_m or _USUAL_SIGMA_M)
-        return frame.near(fix.latitude_deg, fix.longitude_deg, within_m)
+        near = frame.near(fix.latitude_deg, fix.longitude_deg, within_m)
+        return [graph.index(one) for one in near]
 
     return suggest
 

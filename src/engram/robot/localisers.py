@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TypeAlias, TypedDict, Unpack
 
 import numpy as np
@@ -10,10 +11,12 @@ import numpy as np
 from engram.errors import ConfigError, InputError, SequenceError
 from engram.frontend.frame import DescriptorKind
 from engram.geometry.cameras import StereoCamera
-from engram.graph.basin import MatchBasin
+from engram.graph.basin import BasinConfig, MatchBasin
 from engram.graph.clock import Clocked
+from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Session, SessionId, path_id
 from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.paths import Evidence, PathMemory
 from engram.localiser.attempts import Matcher
 from engram.localiser.localisation import Budget
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, LiveDrive, Localiser, MapParts
@@ -21,7 +24,8 @@ from engram.localiser.relocalisation import RELOCALISERS, Relocaliser
 from engram.localiser.settings import LocaliserConfig
 from engram.maps.map import Map
 from engram.places.words import words_of
-from engram.ranking.context import Background, Lessons, RankingPolicy, uses_words
+from engram.ranking.context import Background, RankingPolicy, uses_words
+from engram.ranking.lessons import Lessons, PagedLessons
 from engram.ranking.policies import policy_named
 from engram.robot.settings import Settings
 from engram.sequences.framelog.reader import FrameLog
@@ -35,7 +39,7 @@ class LocaliserParts(TypedDict, total=False):
         policy: key of `POLICIES`, or a policy.
         budget: attempts per frame; None for 2 lanes × 2 rounds.
         relocaliser: key of `RELOCALISERS`, or one that several drives share; None for none.
-        saves: whether the session is being mapped.
+        saves: whether the session is being mapped: in the whole graph, which grows.
         threads: how many threads the lanes share; None for one each.
         matcher, search: replace the default ones; see `Localiser` and `MapParts`.
         clock: time zone and location of its stamps; None if unknown.
@@ -66,26 +70,21 @@ def localiser_in(
     ranking = policy_named(policy) if isinstance(policy, str) else policy
     descriptor = settings.frontend.descriptor
     words = opened.derived(words_of, descriptor)
-    background = Background(
-        opened.derived(drives_of),
-        opened.derived(lessons_of, camera.fx, settings.localiser),
-        words,
-        opened.cameras,
-    )
+    known = (_whole if parts.get("saves") else _by_pages)(opened, camera.fx, settings.localiser)
+    background = Background(opened.derived(drives_of), known.lessons, words, opened.cameras)
     if uses_words(ranking):
         words.prepare()
-    paths = opened.path_memory.counting(settings.localiser.path_entries.kinds)
     return Localiser(
-        MapParts(opened.graph, paths, opened.frames, background, parts.get("search")),
+        MapParts(known.graph, known.paths, opened.frames, background, parts.get("search")),
         LiveDrive(
-            MatchBasin.of(camera.fx, opened.basin_counts, settings.localiser.basin),
+            known.basin,
             parts.get("live", UNNAMED_LIVE_SESSION),
             parts.get("saves", False),
             parts.get("clock"),
         ),
         policy=ranking,
         budget=parts.get("budget") or Budget(),
-        relocaliser=relocaliser_in(opened, relocaliser, descriptor)
+        relocaliser=relocaliser_in(opened, relocaliser, descriptor, known.graph)
         if isinstance(relocaliser, str)
         else relocaliser,
         config=settings.localiser,
@@ -94,19 +93,23 @@ def localiser_in(
     )
 
 
-def relocaliser_in(opened: Map, name: str, descriptor: DescriptorKind) -> Relocaliser:
+def relocaliser_in(
+    opened: Map, name: str, descriptor: DescriptorKind, graph: ExperienceGraph | None = None
+) -> Relocaliser:
     """The relocaliser of a map.
 
     Args:
         name: key of `RELOCALISERS`.
         descriptor: kind of the live frames' descriptors; used while the map is empty.
+        graph: the graph of the localiser; None for one of the map by pages.
 
     Raises:
         MapCorruptError: the vocabulary or a node's landmarks are damaged.
     """
     if name not in RELOCALISERS:
         raise ConfigError(f"relocaliser {name!r} is unknown; known: {', '.join(RELOCALISERS)}")
-    return RELOCALISERS[name](opened.graph, opened.derived(words_of, descriptor))
+    words = opened.derived(words_of, descriptor)
+    return RELOCALISERS[name](opened.read_graph() if graph is None else graph, words)
 
 
 def drives_of(opened: Map) -> dict[SessionId, Session]:
@@ -121,6 +124,44 @@ def lessons_of(opened: Map, focal_px: float, config: LocaliserConfig) -> Lessons
     rates = basin.success_rate(along_m, across_m)
     viewers = [path_id(session) for session in opened.sessions]
     return Lessons.learnt(opened.graph, opened.path_memory, viewers, made, rates, config.lessons)
+
+
+def graph_in(opened: Map, *, saves: bool) -> ExperienceGraph:
+    """What a localiser searches: a map by pages; where it saves, the whole graph, which grows."""
+    return opened.graph if saves else opened.read_graph()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Known:
+    """What a localiser reads of nodes, edges, paths and attempts."""
+
+    graph: ExperienceGraph
+    paths: PathMemory
+    lessons: Lessons | PagedLessons
+    basin: MatchBasin
+
+
+def _by_pages(opened: Map, focal_px: float, config: LocaliserConfig) -> _Known:
+    graph, pages = opened.read_graph(), opened.pages
+    basin, evidence = opened.derived(_past_drives, focal_px, config.basin)
+    paths = PathMemory(graph, config.path_entries.kinds, pages)
+    return _Known(graph, paths, PagedLessons(evidence, config.lessons), basin)
+
+
+def _past_drives(
+    opened: Map, focal_px: float, config: BasinConfig
+) -> tuple[MatchBasin, Callable[[int, int], Evidence]]:
+    basin = MatchBasin.of(focal_px, opened.pages.basin_counts, config)
+    return basin, opened.pages.evidence(basin)
+
+
+def _whole(opened: Map, focal_px: float, config: LocaliserConfig) -> _Known:
+    return _Known(
+        opened.graph,
+        opened.path_memory.counting(config.path_entries.kinds),
+        opened.derived(lessons_of, focal_px, config),
+        MatchBasin.of(focal_px, opened.basin_counts, config.basin),
+    )
 
 
 DriveSequence: TypeAlias = StereoSequence | FrameLog

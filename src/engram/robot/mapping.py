@@ -381,7 +381,7 @@ def _save(
     writer = header.begin_or_resume(opened)
     relocaliser = setup.options.relocaliser
     words = node_words(opened, settings, relocaliser)
-    finder = relocaliser_with_fixes(opened, sequence, settings, relocaliser)
+    finder = relocaliser_with_fixes(opened, sequence, settings, relocaliser, saves=True)
     localiser = replace(setup, relocaliser=finder).localiser_in(opened, maps=True)
     saved = DriveSession.mapped(opened, writer, localiser, settings, words)
     robot = Robot(front, localiser, saved.result_sink, deadline_ms=setup.options.deadline_ms)

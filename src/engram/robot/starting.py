@@ -87,28 +87,41 @@ def robot_in(
     saving = _saving_in(opened, setup, maps=maps) if maps or remembers else None
     if saving is not None and saving.recovered:  # their drives may be played again
         setup = replace(setup, known=frozenset(opened.sessions))
-    if fix is not None:
-        suggested = suggesting(opened, fix, setup.settings, setup.options.relocaliser)
-        setup = replace(setup, relocaliser=suggested)
-    live = None if saving is None else _live_drive(opened, setup, saving, maps=maps)
+    if saving is not None and maps and (live := _mapped(opened, setup, saving, fix)) is not None:
+        return _robot(setup, opened, live, front)
+    setup = _with_fix(setup, opened, fix)
+    live = None if saving is None else LiveDrive(setup, opened, maps=False, saving=saving)
     return _robot(setup, opened, live, front)
 
 
-def _live_drive(opened: Map, setup: RobotSetup, saving: Saving, *, maps: bool) -> LiveDrive:
-    """The drive as it is kept; where the map cannot be written, the robot localises alone.
+def _with_fix(
+    setup: RobotSetup, opened: Map, fix: ReceiverFix | None, *, saves: bool = False
+) -> RobotSetup:
+    if fix is None:
+        return setup
+    settings, name = setup.settings, setup.options.relocaliser
+    return replace(setup, relocaliser=suggesting(opened, fix, settings, name, saves=saves))
+
+
+def _mapped(
+    opened: Map, setup: RobotSetup, saving: Saving, fix: ReceiverFix | None
+) -> LiveDrive | None:
+    """The drive as it is mapped; None where the map cannot be written: the robot localises alone.
 
     Raises:
         MapLockedError: another process writes to the map.
     """
-    if maps:
-        try:
-            commit_spools(Path(opened.location))
-            return LiveDrive(setup, open_map(opened.location), maps=True, saving=saving)
-        except MapLockedError:
-            raise
-        except MapError as error:  # on a read-only disk it localises, as on a full one
-            saving.state, saving.reason = SavingState.FAILED, str(error)
-    return LiveDrive(setup, opened, maps=False, saving=saving)
+    try:
+        commit_spools(Path(opened.location))
+        written = open_map(opened.location)
+        return LiveDrive(
+            _with_fix(setup, written, fix, saves=True), written, maps=True, saving=saving
+        )
+    except MapLockedError:
+        raise
+    except MapError as error:  # on a read-only disk it localises, as on a full one
+        saving.state, saving.reason = SavingState.FAILED, str(error)
+        return None
 
 
 def _saving_in(opened: Map, setup: RobotSetup, *, maps: bool) -> Saving:

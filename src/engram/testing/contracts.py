@@ -37,7 +37,8 @@ from engram.graph.model import (
 from engram.graph.neighbourhood import Neighbourhood
 from engram.graph.paths import ALL_KINDS, Attempts, PathMemory
 from engram.places.words import NodeWords
-from engram.ranking.context import Background, Foreseen, Lessons, RankingContext, RankingPolicy
+from engram.ranking.context import Background, Foreseen, RankingContext, RankingPolicy
+from engram.ranking.lessons import Lessons
 from engram.ranking.recent import Observations, RunAttempts
 from engram.sequences.framelog.reader import FrameLog
 from engram.sequences.images import IMAGE_SUFFIXES

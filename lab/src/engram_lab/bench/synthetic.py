@@ -13,7 +13,8 @@ from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Node, PathEntry, PathEntryKind, PathId, SessionId, node_id
 from engram.graph.neighbourhood import Neighbourhood
 from engram.graph.paths import Attempts, PathMemory
-from engram.ranking.context import Background, Lessons, RankingContext
+from engram.ranking.context import Background, RankingContext
+from engram.ranking.lessons import Lessons
 from engram.ranking.recent import Observations, RunAttempts
 
 _CAMERA = CameraId("0" * 32)

@@ -394,7 +394,8 @@ class Replay(ResultSink):
     def _relocaliser(self) -> Relocaliser | None:
         """One for all segments, since indexing all nodes is slow."""
         name, descriptor = self._options.relocaliser_name, self._settings.frontend.descriptor
-        return None if name is None else relocaliser_in(self._merge.centre, name, descriptor)
+        centre = self._merge.centre
+        return None if name is None else relocaliser_in(centre, name, descriptor, centre.graph)
 
     def _localiser_of(
         self, session: Session, segment: Segment, relocaliser: Relocaliser | None

@@ -1,0 +1,243 @@
+"""A map that is read by pages says what the whole one says, to the bit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from engram.frontend.frame import BRIEF
+from engram.geometry.se3 import SE3
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, Removal, path_id
+from engram.graph.neighbourhood import Search
+from engram.graph.pages import PagedGraph
+from engram.graph.paths import Attempts, PathMemory
+from engram.localiser.settings import LocaliserConfig
+from engram.maps.map import Map
+from engram.maps.writer import RevisionWriter
+from engram.robot.localisers import _by_pages, _whole
+
+from .frames import CAMERA, FRONTEND, frame
+from .maps import attempt, node, session
+
+_SIGMA = np.diag([0.05**2] * 3 + [0.01**2] * 3)
+_VAGUE = 400 * _SIGMA
+LENGTH = 90  # of a drive: more than a page, and no multiple of it
+
+
+def _edge(a: Node, b: Node, kind: EdgeKind, rng: np.random.Generator) -> Edge:
+    metres = b.driven_m - a.driven_m
+    pose = SE3.exp([0.05 * rng.normal(), 0.0, metres, 0.0, 0.02 * rng.normal(), 0.0])
+    return Edge(a.id, b.id, kind, pose, _VAGUE if rng.random() < 0.05 else _SIGMA)
+
+
+class _Town:
+    """Drives along one street, with what past drives leave: edges, paths and attempts."""
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(0)
+        self.nodes: list[Node] = []
+
+    def drive(self, writer: RevisionWriter, name: str, *, silent: bool = False) -> None:
+        rng, made = self.rng, session(name, 10**12 + len(self.nodes) * 10**9)
+        writer.add_session(made, CAMERA, descriptor=BRIEF, frontend=FRONTEND)
+        known, own = list(self.nodes), list[Node]()
+        for index in range(LENGTH):
+            one = node(made, index)
+            writer.add_node(one, frame(one.stamp_ns, count=4, seed=index))
+            if own and index != 40:  # a gap of odometry
+                writer.add_edge(_edge(own[-1], one, EdgeKind.ODOMETRY, rng))
+            near = [other for other in known if abs(other.driven_m - one.driven_m) < 4]
+            picked = [near[at] for at in rng.permutation(len(near))[:4]]
+            for other in picked:
+                writer.add_edge(_edge(other, one, rng.choice(list(_CROSS)), rng))
+            visits = [(one, PathEntryKind.SAVED), *((o, PathEntryKind.MATCHED) for o in picked[:2])]
+            for at, (visited, kind) in enumerate(visits):
+                place = 3 * index + at
+                writer.add_path_entry(
+                    PathEntry(path_id(made.id), place, visited.id, kind, one.stamp_ns)
+                )
+            if not silent and own:
+                tried = [
+                    attempt(
+                        index,
+                        own[-1].id,
+                        other.id,
+                        along_m=float(rng.normal()),
+                        accepted=bool(rng.random() < 0.6),
+                        rank=rank,
+                    )
+                    for rank, other in enumerate([own[-1], *picked])
+                ]
+                writer.copy_attempts(made.id, *Attempts.of(tried))
+            own.append(one)
+        self.nodes += own
+
+    def supersede(self, writer: RevisionWriter, edges: list[Edge]) -> None:
+        for one in edges:
+            ends = {end.id: end for end in self.nodes}
+            writer.add_edge(_edge(ends[one.a], ends[one.b], one.kind, self.rng))
+
+
+_CROSS = (EdgeKind.MATCH, EdgeKind.PROXIMITY)
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Revisions: 1 two drives, 2 a third, 3 newer edges and a removal, 4 a fourth, 5 reverts 2."""
+    path, made = tmp_path_factory.mktemp("town") / "town.engram", _Town()
+    with Map.create(path) as opened:
+        with opened.begin_revision(author="a", message="", configuration={}) as writer:
+            made.drive(writer, "one")
+            made.drive(writer, "two", silent=True)
+            writer.commit()
+        with opened.begin_revision(author="a", message="", configuration={}) as writer:
+            made.drive(writer, "three")
+            writer.commit()
+        opened.forget()
+        edges = [one for one in opened.graph.edges if one.kind is not EdgeKind.ODOMETRY]
+        with opened.begin_revision(author="a", message="", configuration={}) as writer:
+            made.supersede(writer, edges[5:100:9])
+            gone = edges[7]
+            writer.add_mark(Removal(gone.a, gone.b, gone.kind, gone.a_from_b, "wrong", 5))
+            writer.commit()
+        with opened.begin_revision(author="a", message="", configuration={}) as writer:
+            made.drive(writer, "four")
+            writer.commit()
+        opened.revert(2, author="a")
+    return path
+
+
+@pytest.fixture(scope="module", params=[1, 3, 4, None])
+def opened(town: Path, request: pytest.FixtureRequest) -> Iterator[Map]:
+    with Map.open(town, at=request.param) as found:
+        yield found
+
+
+def _ids(graph: ExperienceGraph, nodes: np.ndarray) -> list[object]:
+    return [graph.node(index).id for index in nodes.tolist()]
+
+
+@pytest.mark.parametrize("budget_bytes", [0, 10**9])
+def test_searches_find_the_same(opened: Map, budget_bytes: int) -> None:
+    whole, paged = opened.graph, PagedGraph(opened.pages, budget_bytes)
+    rng = np.random.default_rng(1)
+    for number in rng.permutation(len(whole))[:120].tolist():
+        one = whole.node(number)
+        index = paged.index(one.id)
+        assert paged.node(index) == one
+        live = SE3.exp(0.3 * rng.normal(size=6) * [1, 0, 1, 0, 1, 0])
+        search = Search(float(rng.uniform(3, 12)), 0.8)
+        covariance = rng.choice([1.0, 100.0]) * _SIGMA
+        paged.trim()
+        ours = paged.neighbourhood(index, live, covariance, search)
+        theirs = whole.neighbourhood(number, live, covariance, search)
+        assert _ids(paged, ours.nodes) == _ids(whole, theirs.nodes)
+        for name in ("node_from_live", "sigma_m", "sigma_yaw_rad", "pivot_in_node", "yaw_rad"):
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+        np.testing.assert_array_equal(
+            paged.uuid_words_of(ours.nodes), whole.uuid_words_of(theirs.nodes)
+        )
+        assert [paged.session(n) for n in paged.sessions_of(ours.nodes).tolist()] == [
+            whole.session(n) for n in whole.sessions_of(theirs.nodes).tolist()
+        ]
+
+
+def test_questions_about_nodes_have_the_same_answers(opened: Map) -> None:
+    whole, paged = opened.graph, opened.read_graph()
+    indices = {index: node for index, node in enumerate(paged.ids(0)) if node is not None}
+    assert list(indices.values()) == [one.id for one in whole.nodes]
+    for number, (index, one) in enumerate(indices.items()):
+        ours, theirs = paged.edges_of(index), whole.edges_of(number)
+        assert [(e.a, e.b, e.kind) for e in ours] == [(e.a, e.b, e.kind) for e in theirs]
+        for a, b in zip(ours, theirs, strict=True):
+            np.testing.assert_array_equal(a.covariance, b.covariance)
+        assert _ids(paged, paged.beside(index, 3.0)) == _ids(whole, whole.beside(number, 3.0))
+        other = list(indices)[(7 * number) % len(indices)]
+        known, expected = (
+            graph.predict(graph.index(one), graph.index(indices[other])) for graph in (paged, whole)
+        )
+        assert (known is None) == (expected is None)
+        if known is not None and expected is not None:
+            np.testing.assert_array_equal(known[0].matrix(), expected[0].matrix())
+            np.testing.assert_array_equal(known[1], expected[1])
+    ours, theirs = paged.half_edges(3.0), whole.half_edges(3.0)
+    pairs = [
+        sorted(zip(_ids(graph, half.sources), _ids(graph, half.targets), strict=True))
+        for graph, half in ((paged, ours), (whole, theirs))
+    ]
+    assert pairs[0] == pairs[1]
+
+
+def test_hidden_nodes_are_not_there(town: Path) -> None:
+    with Map.open(town, at=4) as before, Map.open(town) as after:
+        paged = after.read_graph()
+        hidden = [one for one in before.graph.nodes if one.id not in after.graph]
+        assert len(hidden) == LENGTH
+        assert not any(one.id in paged for one in hidden)
+        gaps = [index for index, one in enumerate(paged.ids(0)) if one is None]
+        assert len(gaps) == LENGTH
+        assert not any(map(paged.holds, gaps))
+
+
+def test_lessons_basin_and_paths_are_the_same(opened: Map) -> None:
+    ours = _by_pages(opened, CAMERA.fx, LocaliserConfig())
+    theirs = _whole(opened, CAMERA.fx, LocaliserConfig())
+    np.testing.assert_array_equal(ours.basin.rates, theirs.basin.rates)
+    numbers = np.arange(len(theirs.graph), dtype=np.int32)
+    nodes = np.array([ours.graph.index(one.id) for one in theirs.graph.nodes], np.int32)
+    np.testing.assert_array_equal(
+        ours.lessons.log_odds_of(nodes), theirs.lessons.log_odds_of(numbers)
+    )
+    for kinds in ({PathEntryKind.MATCHED}, set(PathEntryKind)):
+        paths, known = ours.paths.counting(kinds), theirs.paths.counting(kinds)
+        for some in (slice(0, 70), slice(-90, None)):
+            np.testing.assert_array_equal(
+                paths.co_occurrence(nodes[some], nodes), known.co_occurrence(numbers[some], numbers)
+            )
+        seen = slice(20, 30)
+        outcomes = np.arange(10) % 2 == 0
+        np.testing.assert_array_equal(
+            paths.scores(nodes, paths.evidence(nodes[seen], outcomes, int(nodes[3]))),
+            known.scores(numbers, known.evidence(numbers[seen], outcomes, int(numbers[3]))),
+        )
+
+
+def test_what_is_added_stays(town: Path) -> None:
+    rng = np.random.default_rng(3)
+    with Map.open(town, at=4) as opened:
+        whole, paged = opened.graph, PagedGraph(opened.pages, 0)
+        made = session("new", 5)
+        known = [whole.node(index) for index in (3, 70, 200)]
+        new = [node(made, index) for index in range(5)]
+        edges = [_edge(a, b, EdgeKind.ODOMETRY, rng) for a, b in pairwise(new)]
+        edges += [_edge(a, b, EdgeKind.MATCH, rng) for a, b in zip(known, new, strict=False)]
+        edges.append(next(_changed(one) for one in whole.edges if one.a == known[0].id))
+        for graph in (whole, paged):
+            for one in new:
+                graph.add_node(one)
+            graph.add_edges(edges)
+        for _ in range(3):
+            for one in (*known, *new):
+                ours, theirs = (
+                    graph.neighbourhood(graph.index(one.id), SE3.identity(), _SIGMA, Search(9, 3.0))
+                    for graph in (paged, whole)
+                )
+                assert _ids(paged, ours.nodes) == _ids(whole, theirs.nodes)
+                np.testing.assert_array_equal(ours.node_from_live, theirs.node_from_live)
+                paged.trim()
+        assert paged.find_edge(edges[-1].a, edges[-1].b, edges[-1].kind) is not None
+        assert [paged.node(paged.index(one.id)) for one in new] == new
+        memory = PathMemory(paged, pages=opened.pages)
+        memory.add(PathEntry(path_id(made.id), 0, new[0].id, PathEntryKind.SAVED, 1))
+        assert memory.on_paths(
+            [path_id(made.id)], np.array([0, len(paged) - 5], np.int32)
+        ).tolist() == [[False, True]]
+
+
+def _changed(one: Edge) -> Edge:
+    return Edge(one.a, one.b, one.kind, SE3(np.eye(3), np.array([0.0, 0.0, 0.5])), _SIGMA)
