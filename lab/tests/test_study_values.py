@@ -21,7 +21,7 @@ from engram.robot.settings import RobotOptions, Settings
 from engram.sequences.opening import open_drive
 from engram.testing.contracts import make_context
 from engram_lab import trial
-from engram_lab.studies.fleet.results import Parallel, Time
+from engram_lab.studies.fleet.report import Parallel, Time
 from engram_lab.studies.fleet.steps import _united
 
 

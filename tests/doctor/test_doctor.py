@@ -27,12 +27,12 @@ from engram.robot.settings import Settings
 from engram.viewing.pictures import side_picture
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.studies.faults.injected import (
-    Frozen,
-    LateSide,
     blurred,
     brightened,
     exchanged,
+    frozen,
     halved,
+    late_side,
     lowered,
     on_both,
     turned,
@@ -108,7 +108,7 @@ FAULTS: dict[str, tuple[str, Callable[[list[StereoPair]], list[StereoPair]]]] = 
     "upside down": ("upside_down", each(lambda one: exchanged(on_both(one, turned)))),
     "late": (
         "not_synchronised",
-        lambda pairs: [one.pair for one in LateSide().apply(pairs, 1, 1, RNG)][1:],
+        lambda pairs: [one.pair for one in late_side(pairs, 1, 1, RNG)][1:],
     ),
     "rows": ("rows_misaligned", each(lambda one: replace(one, right=lowered(one.right, 2.5)))),
     "rolled": (
@@ -121,15 +121,15 @@ FAULTS: dict[str, tuple[str, Callable[[list[StereoPair]], list[StereoPair]]]] = 
     ),
     "frozen": (
         "frozen_stream",
-        lambda pairs: [one.pair for one in Frozen().apply(pairs, 5, 6, RNG)],
+        lambda pairs: [one.pair for one in frozen(pairs, 5, 6, RNG)],
     ),
     "right frozen": (
         "frozen_stream",
-        lambda pairs: [one.pair for one in Frozen(("right",)).apply(pairs, 5, 6, RNG)],
+        lambda pairs: [one.pair for one in frozen(pairs, 5, 6, RNG, ("right",))],
     ),
     "one stale": (
         "repeated_images",
-        lambda pairs: [one.pair for one in Frozen().apply(pairs, 1, 6, RNG)],
+        lambda pairs: [one.pair for one in frozen(pairs, 1, 6, RNG)],
     ),
     "dark": ("no_odometry", each(lambda one: on_both(one, lambda i: brightened(i, 0.02)))),
     "bright": ("overexposed", each(lambda one: on_both(one, lambda i: brightened(i, 6)))),

@@ -16,7 +16,7 @@ from engram.frontend.features import FEATURES
 from engram.frontend.frame import TEBLID
 from engram_lab.bench.data import BenchData, synthetic_drive
 from engram_lab.bench.runner import run_bench
-from engram_lab.fits.reference_matcher import reference_frame
+from engram_lab.fits.world import reference_frame
 
 CURE = "pip install --force-reinstall --no-deps opencv-contrib-python-headless"
 

@@ -17,8 +17,8 @@ from engram.odometry.odometry import Odometry
 from engram.odometry.outside import OutsideModel, OutsideMotion
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.studies.faults.injected import (
-    FixedPattern,
     brightened,
+    fixed_pattern,
     halved,
     on_both,
     reaching_in,
@@ -46,8 +46,7 @@ def at_rest(pairs: Sequence[StereoPair]) -> list[StereoPair]:
 
 
 def with_pattern(pairs: Sequence[StereoPair], share: float, **kind: object) -> list[StereoPair]:
-    pattern = FixedPattern(**kind)  # type: ignore[arg-type]
-    shown = pattern.apply(pairs, share, 0, np.random.default_rng(3))
+    shown = fixed_pattern(pairs, share, 0, np.random.default_rng(3), **kind)  # type: ignore[arg-type]
     return [noisy(one.pair, k, 0.7) for k, one in enumerate(shown)]
 
 

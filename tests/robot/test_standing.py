@@ -19,10 +19,10 @@ from engram.robot.mapping import map_drive
 from engram.sequences.sequence import SequenceInfo
 from engram_lab.bench.data import synthetic_drive
 from engram_lab.studies.faults.injected import (
-    FixedPattern,
-    NeverMoved,
     Shown,
+    fixed_pattern,
     halved,
+    never_moved,
     on_both,
     undisturbed,
 )
@@ -106,13 +106,13 @@ def test_an_undisturbed_robot_is_localised(pairs, street) -> None:
 @pytest.mark.parametrize("burnt_in", [False, True])
 @pytest.mark.parametrize("wheels", [False, True])
 def test_a_stream_frozen_from_the_start_claims_nothing(pairs, street, burnt_in, wheels) -> None:
-    frozen = NeverMoved(burnt_in=burnt_in).apply(pairs, FRAMES, 0, np.random.default_rng(0))
+    frozen = never_moved(pairs, FRAMES, 0, np.random.default_rng(0), burnt_in=burnt_in)
     claimed = claims(street, later(frozen), [AHEAD] * FRAMES if wheels else None)
     assert not false(claimed)
 
 
 def test_added_noise_does_not_hide_it_from_wheels(pairs, street) -> None:
-    frozen = NeverMoved().apply(pairs, FRAMES, 0, np.random.default_rng(0))
+    frozen = never_moved(pairs, FRAMES, 0, np.random.default_rng(0))
     noise = [replace(one, pair=noisy(one.pair, 100 + k)) for k, one in enumerate(frozen)]
     assert not false(claims(street, later(noise), [AHEAD] * FRAMES))
 
@@ -150,8 +150,7 @@ def test_a_simulator_without_noise_is_localised_at_rest_by_its_wheels(pairs, str
 
 @pytest.mark.parametrize(("share", "contrast"), [(0.2, 1.0), (0.4, 0.4), (0.5, 1.0)])
 def test_a_bonnet_neither_shrinks_a_map_nor_is_a_place(pairs, tmp_path, share, contrast) -> None:
-    bonnet = FixedPattern(side="bottom", depth_m=1.6, contrast=contrast)
-    shown = bonnet.apply(pairs, share, 0, np.random.default_rng(1))
+    shown = fixed_pattern(pairs, share, 0, np.random.default_rng(1), "bottom", 1.6, contrast)
     for opened in mapped([one.pair for one in shown], tmp_path / "bonnet.engram"):
         assert opened.graph.edges
         way_m = sum(edge.a_from_b.distance_m for edge in opened.graph.edges)

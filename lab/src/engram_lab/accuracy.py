@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.errors import InputError
 from engram.geometry.se3 import SE3
 
 # A success with a greater error is a false one. Source: method §8.
@@ -34,22 +33,6 @@ class PoseErrors:
     def false(self) -> NDArray[np.bool_]:
         """(N,) bool: more than 1 m or 5° off. Source: method §8."""
         return (self.offset_m > FALSE_M) | (self.turn_rad > FALSE_RAD)
-
-
-def pose_errors(estimated: Sequence[SE3], true: Sequence[SE3]) -> PoseErrors:
-    """Errors of ``node_from_live`` estimates against the true ones, pairwise.
-
-    Raises:
-        InputError: their numbers differ.
-    """
-    if len(estimated) != len(true):
-        raise InputError(f"{len(estimated)} estimated poses, but {len(true)} true ones")
-    offsets = [
-        float(np.linalg.norm(e.translation - t.translation))
-        for e, t in zip(estimated, true, strict=True)
-    ]
-    turns = [(t.inverse() @ e).angle_rad for e, t in zip(estimated, true, strict=True)]
-    return PoseErrors(np.array(offsets, np.float64), np.array(turns, np.float64))
 
 
 def is_false(error_m: float, error_rad: float) -> bool:
@@ -83,14 +66,8 @@ class Count:
     """What robots made of the frames that they were shown; counts add up.
 
     Attributes:
-        robots, frames: how many.
-        metres: driven.
         fixes: whose truth is known; `off` more than 0.5 m off, `false` more than 1 m or 5°, and
             `sure` false ones that claim a confidence above 7.
-        hurt: robots with a false fix.
-        events: runs of false fixes.
-        worst_m: largest error of a fix.
-        again: frames until the first right fix after what happened, of each robot that had one.
     """
 
     robots: int = 0
@@ -107,13 +84,7 @@ class Count:
 
     @staticmethod
     def of(fixes: Sequence[Fix], world_from_cam: Sequence[SE3], after: int = 0) -> Count:
-        """One robot.
-
-        Args:
-            fixes: its fixes, in their order.
-            world_from_cam: true pose at each frame that it was shown.
-            after: number of the first frame after what happened.
-        """
+        """One robot."""
         false = [one for one in fixes if one.false]
         right = [one.at - after for one in fixes if not one.false and one.at >= after]
         return Count(

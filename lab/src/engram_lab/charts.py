@@ -27,11 +27,8 @@ class Line:
     """One line of a panel.
 
     Attributes:
-        label: for the legend; equal labels get equal looks in all panels of a picture.
         x, y: (N,) float64.
         low, high: (N,) float64, ends of a confidence band; None for none.
-        marks: whether the points are marked.
-        loose_end: the last stretch is dotted: what lies between is not known, or without limit.
     """
 
     label: str
@@ -48,8 +45,6 @@ class Panel:
     """One set of axes.
 
     Attributes:
-        title, x_label, y_label: words beside it.
-        lines: what is drawn.
         x_ticks: places of ticks and what stands there; None for Matplotlib's own.
         least_y: the ordinate is logarithmic from here on, if anything lies above; None for a linear
             one.
@@ -82,18 +77,7 @@ def draw_curves(
     title: str,
     looks: Mapping[str, tuple[str, str]] = MappingProxyType({}),
 ) -> None:
-    """Draws panels into an image file, up to four in a row, with one legend.
-
-    Args:
-        panels: what is drawn.
-        path: image file.
-        title: over the picture.
-        looks: label → Matplotlib's colour and line style, for labels that are to look alike in
-            several pictures.
-
-    Raises:
-        MissingExtraError: Matplotlib is not installed.
-    """
+    """Draws panels into an image file, up to four in a row, with one legend."""
     rows = -(-len(panels) // _PANELS_IN_A_ROW)
     columns = -(-len(panels) // rows)
     width = max(4.6 * columns, 6.5) + 2.0
@@ -146,16 +130,7 @@ def _draw_axes(axes: Any, panel: Panel) -> None:
 def draw_bars(
     values: Sequence[tuple[str, Sequence[tuple[str, float]]]], path: Path, title: str
 ) -> None:
-    """Draws one panel of horizontal bars per quantity into an image file.
-
-    Args:
-        values: quantity → its bars, label and length each, first on top.
-        path: image file.
-        title: over the picture.
-
-    Raises:
-        MissingExtraError: Matplotlib is not installed.
-    """
+    """Draws one panel of horizontal bars per quantity into an image file."""
     longest = max((len(bars) for _, bars in values), default=1)
     figure, axes = subplots(len(values), width=4.0 * len(values), height=1.2 + 0.24 * longest)
     for one, (quantity, bars) in zip(axes, values, strict=True):

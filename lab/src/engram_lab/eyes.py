@@ -41,10 +41,7 @@ def same_corners(
     """Rows (M, 2) of landmarks of `a` and of `b` that show the same corner.
 
     Args:
-        a, b: landmarks of two views.
         b_from_a: (4, 4), true pose of the one camera in the other.
-        camera: of `b`.
-        within_px: largest distance of a corner of `a`, projected, times the octave's scale.
     """
     points = a.points_in_cam.astype(np.float64) @ b_from_a[:3, :3].T + b_from_a[:3, 3]
     seen = np.flatnonzero(points[:, 2] > 0.5)
@@ -87,7 +84,6 @@ class Patches:
 
     Args:
         image: (h, w) uint8.
-        octaves: how many the front-end uses.
     """
 
     def __init__(self, image: NDArray[np.uint8], octaves: int = 2) -> None:
@@ -152,12 +148,8 @@ class Scene:
     """Places (K) on several visits (V), all by one camera.
 
     Attributes:
-        name: of the town and what it is for.
-        camera: of all pairs.
-        visits: their names.
         world_from_cam: (V, K, 4, 4) float64, true poses of the left camera.
         left, right: (V, K, h, w) uint8 images.
-        landmarks: of each (visit, place), without descriptors.
     """
 
     name: str

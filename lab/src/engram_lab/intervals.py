@@ -54,11 +54,7 @@ class Resamples:
 
     @staticmethod
     def of(sessions: int, resamples: int = 2000, seed: int = 0) -> Resamples:
-        """Draws `sessions` sessions with replacement, `resamples` times.
-
-        Raises:
-            InputError: there is no session, or no resample is asked for.
-        """
+        """Draws `sessions` sessions with replacement, `resamples` times."""
         if sessions < 1 or resamples < 1:
             raise InputError(f"cannot draw {resamples} times from {sessions} sessions")
         rng = np.random.default_rng(seed)
@@ -103,11 +99,7 @@ class SessionSums:
             )
 
     def __call__(self, weights: Array) -> Array:
-        """(N,) the measure under (N, S) weights; NaN where nothing was driven.
-
-        Raises:
-            InputError: the weights are of another number of sessions.
-        """
+        """(N,) the measure under (N, S) weights; NaN where nothing was driven."""
         if weights.ndim != 2 or weights.shape[1] != len(self.numerator):
             raise InputError(
                 f"a measure over {len(self.numerator)} sessions cannot be weighed by draws of "

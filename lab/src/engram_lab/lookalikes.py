@@ -28,7 +28,6 @@ class Lookalike:
     """A node and the place that looks most like it, its surroundings left out.
 
     Attributes:
-        node, like: the one, and the one that it looks like.
         similarity: cosine of their bags of words, 0…1.
     """
 
@@ -42,8 +41,6 @@ class Confusion:
     """How alike the places of a map look.
 
     Attributes:
-        nodes: how many the map has.
-        lookalikes: one per node that has a place outside of its surroundings, most alike first.
         matrix: (M, M) float32, similarity of M nodes, evenly taken in the order of saving, to
             each other.
     """
@@ -59,12 +56,7 @@ def find_lookalikes(
     """Compares every node of a map with every other by their words.
 
     Args:
-        map_path: the map.
         at: number of its revision; None for the newest.
-        monitor: hears of each node.
-
-    Raises:
-        MapError: the map cannot be read.
     """
     with open_map(map_path, at) as opened:
         words = _words(opened)
@@ -92,11 +84,7 @@ def find_lookalikes(
 
 
 def write_confusion_picture(file: Path, confusion: Confusion) -> None:
-    """The similarities as a square picture: bright off the diagonal is what looks alike.
-
-    Raises:
-        InputError: the map has no nodes, or the file cannot be written.
-    """
+    """The similarities as a square picture: bright off the diagonal is what looks alike."""
     if confusion.matrix.size == 0:
         raise InputError("the map has no nodes: there is nothing to draw")
     grey = np.clip(255 * confusion.matrix, 0, 255).astype(np.uint8)

@@ -274,11 +274,7 @@ class OraclePolicy:
     looks_ahead = True
 
     def rank(self, context: RankingContext) -> NDArray[np.int64]:
-        """See `RankingPolicy`.
-
-        Raises:
-            ConfigError: nobody can tell what will match, as on a robot.
-        """
+        """See `RankingPolicy`."""
         if context.foresee is None:
             raise ConfigError(
                 "the policy oracle needs the matches in advance, and this context has none; "

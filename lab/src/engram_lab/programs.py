@@ -13,13 +13,7 @@ from engram.monitor import write_whole
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One measured number.
-
-    Attributes:
-        name: what was measured.
-        value: of it.
-        unit: of the value; "" for a plain number.
-    """
+    """One measured number."""
 
     name: str
     value: float

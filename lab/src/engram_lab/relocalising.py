@@ -34,15 +34,12 @@ class ColdStart:
     """One frame, localised without the frames before it.
 
     Attributes:
-        stamp_ns: of the frame.
         status: found by matching; or not found; or certainly new, since the map holds no place at
             all; or the frame was of no use.
         node: the node that it was matched with; None unless found.
         inliers: of that match; 0 unless found.
-        attempts: match attempts made.
         new_place: probability of a new place before matching; None where the relocaliser cannot
             tell. Not to be relied on.
-        damaged: nodes that were to be attempted and whose landmarks cannot be read.
     """
 
     stamp_ns: int
@@ -80,18 +77,8 @@ def relocalise_drive(
     """Finds every frame of a drive in a map as if the robot had just been switched on.
 
     Args:
-        map_path: the map, which stays as it is.
-        sequence: the drive.
-        settings: the resolved configuration.
-        relocaliser: key of `RELOCALISERS`.
-        budget: of each frame: that of a lost robot.
         threads: most threads that its lanes share; None for one each.
         at: number or tag of the map's revision; None for the newest.
-        monitor: hears of each frame, with its status.
-
-    Raises:
-        ConfigError: there is no such relocaliser.
-        MapError: the map cannot be read.
     """
     with open_map(map_path, at) as opened:
         settings = settings.for_descriptor(opened.descriptor)

@@ -16,11 +16,6 @@ class ThereAndBack:
 
     The camera keeps looking the same way, so driving back is driving in reverse. Every image is
     decoded once and kept.
-
-    Args:
-        sequence: at least two pairs.
-        count: frames altogether.
-        rate_hz: rate of the new stamps.
     """
 
     def __init__(self, sequence: StereoSequence, count: int, rate_hz: float = 20.0) -> None:

@@ -39,16 +39,8 @@ class Trial:
     """One drive in one download.
 
     Attributes:
-        name: of the options.
-        drive: session of the drive, as text.
-        report: of the download.
-        steps: of the drive: distances and matches.
         ms_per_frame: mean time of localising a frame, relocalisation included, without front-end
             and odometry.
-        lookup_ms_per_frame: of that, asking the relocaliser.
-        lookups: frames for which it was asked.
-        nodes: that were sent.
-        asked: what the part keeps of the settings that it was chosen by.
     """
 
     name: str
@@ -67,14 +59,8 @@ class TrialSummary:
     """All drives in one kind of download.
 
     Attributes:
-        name: of the options.
-        drives: how many.
-        route_m: how far they went together.
-        nodes, size_bytes: mean over the downloads.
         expected_missed, missed: share of the way without a match, promised and met.
         p_no_match_10m: failure curve at 10 m (estimator *route*).
-        longest_gap_m: of all drives.
-        ms_per_frame: mean over the drives.
     """
 
     name: str
@@ -103,10 +89,7 @@ class LeftOut:
     """A drive for which some options found nothing to send.
 
     Attributes:
-        name: of the options.
-        drive: session of the drive, as text.
         depart_h: the drive's hour of day; None if it is not known.
-        why: what was not found.
     """
 
     name: str
@@ -126,14 +109,7 @@ def check_not_sent(
     """Refuses drives that downloads of a centre may hold: they would do well in any.
 
     Args:
-        centre: the map.
-        drives: that downloads are to be held against, each with what people call it.
         at: revision of the centre; None for the newest.
-
-    Raises:
-        ConfigError: the centre holds one of them, under whatever name of the robot.
-        MapError: the centre cannot be read.
-        SequenceError: a drive cannot be read.
     """
     if drives:
         with Map.open(centre, at=at) as store:
@@ -155,21 +131,10 @@ def try_downloads(
     """Download for each drive by each method, and localise it there without writing anything.
 
     Args:
-        centre: the map.
-        wanted: options by name; the drive's hour of day, where it is known, stands for theirs.
-        drives: open a held-out drive each.
-        settings: of the localiser.
-        localise: policy and budget.
-        monitor: hears of each frame.
         at: revision of the centre; None for the newest.
         start: where a drive begins in a download; None if nobody knows: it begins lost.
         left_out: is told of a drive for which one of the options fits nothing; it is tried in
             none of the others then, so that all are of the same drives. None for an error.
-
-    Raises:
-        ConfigError: the centre holds one of the drives itself; nothing was tried.
-        InputError: a drive's options fit nothing, and nobody is told.
-        MapError: the centre cannot be read, or a download not be written.
     """
     opened = [open_drive() for open_drive in drives]
     check_not_sent(centre, [(sequence.info.name, sequence) for sequence in opened], at)

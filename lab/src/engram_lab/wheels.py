@@ -41,9 +41,6 @@ def measured(
 
     Args:
         truth: world_from_cam of each frame.
-        stamps_ns: of each frame.
-        seed: of noise and slip.
-        wheels: what is wrong with them.
     """
     rng = np.random.default_rng(seed)
     seconds = np.diff(np.array(stamps_ns)) / 1e9

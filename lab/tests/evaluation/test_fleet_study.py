@@ -24,8 +24,7 @@ from engram_lab.studies.fleet.plan import (
     make_fleet_plan,
     read_download,
 )
-from engram_lab.studies.fleet.report import write_fleet_report
-from engram_lab.studies.fleet.results import ArmResult
+from engram_lab.studies.fleet.report import ArmResult, write_fleet_report
 from engram_lab.studies.plan import run_tasks
 
 pytestmark = pytest.mark.long

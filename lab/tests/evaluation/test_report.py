@@ -21,6 +21,7 @@ from engram_lab.studies.drives import DriveSet, EvaluatedDrive
 from engram_lab.studies.lockstep import Runs, only, read_runs, write_runs
 from engram_lab.studies.ranking_report import (
     POLICY_COLOURS,
+    collect,
     draw_figures,
     labelled,
     policy_rows,
@@ -28,7 +29,6 @@ from engram_lab.studies.ranking_report import (
     write_report,
 )
 from engram_lab.studies.running import Plan, RankingOptions, make_plan
-from engram_lab.studies.summary import collect
 
 FRAMES = 400
 SESSIONS = 10

@@ -1,22 +1,41 @@
-"""Cross-validation end to end, on tiny synthetic campaigns."""
+"""A ranking study end to end, and what studies share: folds, tasks, maps, matches."""
+
+from __future__ import annotations
 
 import csv
+import os
+import select
 import shutil
+import signal
+import subprocess
+import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from uuid import UUID
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from lab.tests.evaluation.campaigns import few_options, write_campaign
+from tests.builders import World, drive
+from tests.maps import maps
 
-from engram.errors import ConfigError, MapLockedError, SequenceError
+from engram.errors import ConfigError, MapError, MapLockedError, SequenceError, WorkerError
+from engram.frontend.matching import MatcherConfig
+from engram.graph.graph import ExperienceGraph
+from engram.graph.model import NodeId, SessionId, node_id
+from engram.localiser.attempts import Lanes
 from engram.maps.map import open_map
-from engram.robot.settings import Settings
+from engram.monitor import QUIET
+from engram.robot.settings import RobotOptions, Settings
 from engram_lab.studies import building, running
-from engram_lab.studies.configurations import UNLIMITED, Configuration
-from engram_lab.studies.drives import DriveSet, drives_of, open_campaign
-from engram_lab.studies.lockstep import read_runs
-from engram_lab.studies.pages import alone_in
+from engram_lab.studies.building import build_map, true_nodes
+from engram_lab.studies.configurations import EVERYTHING, UNLIMITED, Configuration, sweep
+from engram_lab.studies.drives import DriveSet, KeptMaps, TrueNodes, drives_of, open_campaign, split
+from engram_lab.studies.lockstep import MatchMemo, read_runs
+from engram_lab.studies.plan import Task, alone_in, run_tasks
 from engram_lab.studies.ranking_report import write_report
 from engram_lab.studies.running import Plan, forget, make_plan, run
 from engram_lab.truth import truth_path
@@ -90,11 +109,11 @@ def test_logs_of_one_name_in_several_folders_are_several_drives(
     campaign, plan: Plan, tmp_path: Path
 ) -> None:
     logs = []
-    for number, drive in enumerate(campaign.drives):
+    for number, one in enumerate(campaign.drives):
         folder = tmp_path / f"monday{number}"
         folder.mkdir()
-        logs.append(shutil.copy(drive.path, folder / "log.framelog"))
-        shutil.copy(truth_path(drive.path), truth_path(folder / "log.framelog"))
+        logs.append(shutil.copy(one.path, folder / "log.framelog"))
+        shutil.copy(truth_path(one.path), truth_path(folder / "log.framelog"))
     same = DriveSet(campaign.name, drives_of([Path(one) for one in logs]))
     other = make_plan(same, Settings(), few_options(), tmp_path / "work")
     run(other)
@@ -323,3 +342,278 @@ def test_what_cannot_be_evaluated_is_refused(tmp_path: Path) -> None:
     one = write_campaign(tmp_path / "logs", (0,)).drives[0]
     with pytest.raises(SequenceError, match="same drive"):
         drives_of([one.path, one.path])
+
+
+@given(st.integers(2, 8), st.integers(0, 40), st.integers(0, 5))
+def test_every_session_is_held_out_once_and_never_trained_on_then(folds, more, seed) -> None:
+    sessions = folds + more
+    parts = split(sessions, folds, seed)
+    assert sorted(one for part in parts for one in part.held_out) == list(range(sessions))
+    for part in parts:
+        assert sorted((*part.training, *part.held_out)) == list(range(sessions))
+        assert list(part.training) == sorted(part.training)
+    sizes = [len(part.held_out) for part in parts]
+    assert max(sizes) - min(sizes) <= 1
+
+
+def test_the_seed_decides() -> None:
+    assert split(20, 5, 1) == split(20, 5, 1)
+    assert split(20, 5, 1) != split(20, 5, 2)
+
+
+def test_too_few_sessions_are_refused() -> None:
+    with pytest.raises(ConfigError, match="3 sessions into 5 folds"):
+        split(3, 5)
+
+
+def _write(path: Path) -> None:
+    path.write_text("done")
+
+
+def _die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_dies_is_said_in_one_line(tmp_path: Path) -> None:
+    first = tmp_path / "first"
+    tasks = [
+        Task("first", partial(_write, first)),
+        Task("second", _die, needs=("first",)),
+    ]
+    with pytest.raises(WorkerError, match=r"a worker of 2 died .* --workers"):
+        run_tasks(tasks, 2, QUIET)
+    assert first.read_text() == "done"
+
+
+@pytest.mark.long
+def test_workers_end_with_a_run_that_is_killed() -> None:
+    """Left behind, they would write where the run that goes on writes."""
+    program = "from lab.tests.evaluation.test_running import wait_for_ever; wait_for_ever()"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        workers = [os.pidfd_open(int(parent.stdout.readline())) for _ in range(2)]
+        parent.kill()
+    for worker in workers:
+        ended, _, _ = select.select([worker], [], [], 60)
+        os.close(worker)
+        assert ended
+
+
+def wait_for_ever() -> None:
+    """In a process of its own: two workers that tell who they are and do not end."""
+    run_tasks([Task("one", _tell_and_wait), Task("two", _tell_and_wait)], 2, QUIET)
+
+
+def _tell_and_wait() -> None:
+    os.write(1, f"{os.getpid()}\n".encode())
+    signal.pause()
+
+
+OPTIONS: RobotOptions = few_options().build
+
+
+@pytest.fixture
+def two_drives(tmp_path: Path) -> DriveSet:
+    return write_campaign(tmp_path / "campaign", (0, 0))
+
+
+class FakeMap:
+    """Nodes of a real map, some of them cut off from the rest."""
+
+    def __init__(self, graph: ExperienceGraph, cut_off: int) -> None:
+        self.graph = self
+        self.nodes = graph.nodes
+        self._graph = graph
+        self._cut_off = cut_off
+
+    def index(self, node) -> int:
+        return self._graph.index(node)
+
+    def components(self) -> np.ndarray:
+        return (np.arange(len(self.nodes)) == self._cut_off).astype(np.int32)
+
+
+def test_a_drive_starts_where_the_map_hangs_together(two_drives: DriveSet, tmp_path: Path) -> None:
+    build_map(tmp_path / "town.engram", two_drives.drives, Settings(), OPTIONS)
+    truths = {one.session.id: one.truth() for one in two_drives.drives}
+    with open_map(tmp_path / "town.engram") as opened:
+        nodes = true_nodes(opened, two_drives.drives)
+        alone = opened.graph.nodes[4].id
+        there = nodes.pose(alone)
+        assert there is not None
+        plain = nodes.start(there)
+        cut = TrueNodes(FakeMap(opened.graph, 4), truths).start(there)
+    assert plain is not None
+    assert plain.node == alone
+    assert cut is not None
+    assert cut.node != alone
+    # The same place, seen from another node.
+    pose = nodes.pose(cut.node)
+    assert pose is not None
+    np.testing.assert_allclose((pose @ cut.node_from_live).translation, there.translation)
+
+
+def test_every_candidate_is_attempted_only_where_something_asks_for_it() -> None:
+    assert EVERYTHING not in sweep(("distance", "path-near"), (1, 2), (1,))
+    assert EVERYTHING in sweep(("distance", "oracle"), (1, 2), (1,))
+    assert EVERYTHING in sweep(("path-near",), (2, UNLIMITED), (1,))
+
+
+@pytest.fixture
+def town(tmp_path: Path) -> Path:
+    """A map of two drives of five nodes."""
+    path = tmp_path / "town.engram"
+    with open_map(path, create=True) as store, store.writing():
+        for number in range(2):
+            drive = maps.session(start_ns=1_000 + number * 10**12)
+            writer = maps.begin(store, drive)
+            maps.write_drive(writer)
+            writer.commit()
+    return path
+
+
+def test_a_map_that_was_asked_for_before_is_the_same_one(town: Path) -> None:
+    kept = KeptMaps(files=1)
+    newest, first = kept.open(town), kept.open(town, at=1)
+    assert (len(newest.graph), len(first.graph)) == (10, 5)
+    assert kept.open(town) is newest
+    assert kept.open(town, at=1) is first
+    kept.close()
+    assert kept.open(town) is not newest
+    kept.close()
+
+
+def test_the_file_that_was_asked_for_longest_ago_is_closed(town: Path) -> None:
+    others = [town.with_name(f"other-{number}.engram") for number in range(2)]
+    for other in others:
+        shutil.copyfile(town, other)
+    kept = KeptMaps(files=2)
+    opened = kept.open(town)
+    between = kept.open(others[0])
+    assert kept.open(town) is opened
+    kept.open(others[1])
+    assert kept.open(town) is opened
+    assert kept.open(others[0]) is not between
+    kept.close()
+
+
+def test_a_map_that_was_made_anew_is_opened_anew(town: Path) -> None:
+    kept = KeptMaps(files=2)
+    opened = kept.open(town)
+    draft = town.with_name("draft.engram")
+    shutil.copyfile(town, draft)
+    draft.replace(town)
+    assert kept.open(town) is not opened
+    kept.close()
+
+
+def test_what_is_no_map_is_refused_again_and_again(tmp_path: Path) -> None:
+    path = tmp_path / "town.engram"
+    path.write_bytes(b"no map")
+    kept = KeptMaps(files=1)
+    for _ in range(2):
+        with pytest.raises(MapError):
+            kept.open(path)
+    kept.close()
+
+
+WORLD = World(20.0)
+CONFIG = MatcherConfig()
+LIVE = SessionId(UUID(int=7))
+
+
+class Frames:
+    """Frames in memory, counting how often they are asked for."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+        seen = [*drive(WORLD, np.arange(0.0, 6.0, 2.0)), *drive(WORLD, np.arange(0.0, 6.0, 2.0), 1)]
+        self.nodes = {NodeId(UUID(int=k)): one.frame for k, one in enumerate(seen)}
+
+    def frame(self, node):
+        self.asked += 1
+        return self.nodes[node]
+
+    def prefetch(self, nodes) -> None:
+        raise AssertionError("a memo reads nothing ahead")
+
+
+@pytest.fixture
+def frames() -> Frames:
+    return Frames()
+
+
+def live_frames():
+    return [one.frame for one in drive(WORLD, np.arange(0.3, 4.0, 1.5), seed=3, start_ns=10**15)]
+
+
+def memo_of(frames: Frames, path: Path, matcher_hash: str = "a") -> MatchMemo:
+    return MatchMemo(Lanes(frames, CONFIG), path, matcher_hash)
+
+
+def everything(matcher, frames: Frames) -> list:
+    return [
+        matcher.match(live, node_id(LIVE, live.stamp_ns), node, None)
+        for live in live_frames()
+        for node in frames.nodes
+    ]
+
+
+def assert_same(found, wanted) -> None:
+    assert len(found) == len(wanted)
+    for one, other in zip(found, wanted, strict=True):
+        assert one.inliers == other.inliers
+        assert (one.reference_from_live is None) == (other.reference_from_live is None)
+        if other.reference_from_live is not None:
+            assert (one.reference_from_live.matrix() == other.reference_from_live.matrix()).all()
+            assert (one.covariance == other.covariance).all()
+
+
+def test_what_is_kept_is_to_the_bit_what_would_be_made(frames: Frames, tmp_path: Path) -> None:
+    wanted = everything(Lanes(frames, CONFIG), frames)
+    assert any(one.inliers > 20 for one in wanted)
+    assert any(one.inliers == 0 for one in wanted)
+    memo = memo_of(frames, tmp_path / "memo.npz")
+    assert_same(everything(memo, frames), wanted)
+    memo.save()
+    frames.asked = 0
+    again = memo_of(frames, tmp_path / "memo.npz")
+    assert again.known == len(wanted)
+    assert_same(everything(again, frames), wanted)
+    assert frames.asked == again.made == 0
+
+
+def test_an_attempt_is_made_once(frames: Frames, tmp_path: Path) -> None:
+    memo = memo_of(frames, tmp_path / "memo.npz")
+    everything(memo, frames)
+    made = memo.made
+    everything(memo, frames)
+    assert memo.made == made == len(frames.nodes) * len(live_frames())
+
+
+@pytest.mark.parametrize("damage", ["other matcher", "cut short", "no archive"])
+def test_a_memo_that_does_not_fit_counts_as_empty(
+    frames: Frames, tmp_path: Path, damage: str
+) -> None:
+    path = tmp_path / "memo.npz"
+    memo = memo_of(frames, path)
+    everything(memo, frames)
+    memo.save()
+    if damage == "cut short":
+        path.write_bytes(path.read_bytes()[:-100])
+    elif damage == "no archive":
+        path.write_bytes(b"nothing of the kind")
+    again = memo_of(frames, path, "b" if damage == "other matcher" else "a")
+    assert again.known == 0
+    assert_same(everything(again, frames), everything(Lanes(frames, CONFIG), frames))
+
+
+def test_the_spread_of_inliers_is_known_too(frames: Frames, tmp_path: Path) -> None:
+    matcher, memo = Lanes(frames, CONFIG), memo_of(frames, tmp_path / "memo.npz")
+    live, node = live_frames()[0], next(iter(frames.nodes))
+    live_id = node_id(LIVE, live.stamp_ns)
+    match = matcher.match(live, live_id, node, None)
+    kept = memo.match(live, live_id, node, None)
+    spread = matcher.spread(live, live_id, node, match)
+    assert memo.spread(live, live_id, node, kept) == spread
+    assert min(spread.image, spread.height) > 0

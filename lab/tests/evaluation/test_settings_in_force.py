@@ -32,14 +32,12 @@ from engram_lab.studies.drives import DriveSet, EvaluatedDrive, Fold
 from engram_lab.studies.fleet import steps
 from engram_lab.studies.fleet.experiments import fleet_tasks
 from engram_lab.studies.fleet.plan import VERBS, FleetOptions, FleetPlan, arms_for, make_fleet_plan
-from engram_lab.studies.fleet.report import write_fleet_report
-from engram_lab.studies.fleet.results import ArmResult
+from engram_lab.studies.fleet.report import ArmResult, write_fleet_report
 from engram_lab.studies.in_force import VARIED, by_key, differing, unused
 from engram_lab.studies.lockstep import MatchMemo
 from engram_lab.studies.plan import run_tasks
-from engram_lab.studies.ranking_report import write_report
+from engram_lab.studies.ranking_report import collect, write_report
 from engram_lab.studies.running import Plan, localise_held_out, make_plan, run
-from engram_lab.studies.summary import collect
 
 __all__ = ["engram"]
 PAPERS = ("linegar2015", "gadd2016")

@@ -21,8 +21,7 @@ from engram.fleet.merge.merge_settings import MergeOptions
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.monitor import QUIET
-from engram_lab.fleet_day.day import CuttingProxy, Stages, cutting, listening, run_day
-from engram_lab.fleet_day.robot import DayRobot
+from engram_lab.fleet_day.day import CuttingProxy, DayRobot, Stages, cutting, listening, run_day
 
 COPY = {"select": "copy"}
 
@@ -91,7 +90,7 @@ def test_a_link_that_never_holds_ends_with_what_the_agent_says(
     town: Town, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = town.robot("r1", 1_000)
-    monkeypatch.setattr("engram_lab.fleet_day.robot._ROUNDS", 5)
+    monkeypatch.setattr("engram_lab.fleet_day.day._ROUNDS", 5)
     town.link.close()
     with pytest.raises(EngramError, match=r"not over after 5 rounds, .* broke 5 times"):
         robot.hand_in("first")

@@ -23,14 +23,7 @@ HERE = Path(__file__).parents[4]
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """One stage of both sides.
-
-    Attributes:
-        name: of the stage.
-        ours_ms, theirs_ms: medians over the blocks of the processor time of a run.
-        ratio: median over pairs of blocks of ours ÷ theirs; below 1 this checkout is faster.
-        low, high: quartiles of these ratios.
-    """
+    """One stage of both sides."""
 
     name: str
     ours_ms: float
@@ -43,17 +36,7 @@ class Comparison:
 def compare(
     other: Path, stages: Sequence[str], blocks: int = 12, runs: int = 60
 ) -> Iterator[Comparison]:
-    """Time stages of this checkout and of another one, both built in place.
-
-    Args:
-        other: root of the other checkout.
-        stages: names that both have.
-        blocks: pairs of blocks of each stage, at least 2.
-        runs: of a block.
-
-    Raises:
-        ConfigError: a side does not run the code of its checkout.
-    """
+    """Time stages of this checkout and of another one, both built in place."""
     with ExitStack() as stack:
         sides = [stack.enter_context(_side(root)) for root in (HERE, other.resolve())]
         for side, root in zip(sides, (HERE, other.resolve()), strict=True):

@@ -10,7 +10,6 @@ import os
 import sys
 import time
 from collections import Counter
-from importlib import import_module
 
 if __name__ == "__main__":
     import cv2
@@ -27,11 +26,7 @@ if __name__ == "__main__":
     for line in sys.stdin:
         name, count = line.split()
         if name not in runs:
-            if name in STAGES:
-                runs[name] = STAGES[name](data, None).ours
-            else:  # younger than that checkout: by the modules beside this file
-                younger = {**import_module("attempts").STAGES, **import_module("steps").STAGES}
-                runs[name] = younger[name](data)
+            runs[name] = STAGES[name](data, None).ours
         started = time.process_time()
         for _ in range(int(count)):
             runs[name](done[name])

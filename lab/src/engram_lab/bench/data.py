@@ -20,12 +20,7 @@ _SMALL_WIDTH_PX, _SMALL_HEIGHT_PX = 512, 384
 
 @dataclass(frozen=True)
 class BenchData:
-    """A drive in memory.
-
-    Attributes:
-        name: what it is, for people.
-        full: its pairs at their own size.
-    """
+    """A drive in memory."""
 
     name: str
     full: tuple[StereoPair, ...]

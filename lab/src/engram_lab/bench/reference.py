@@ -69,7 +69,6 @@ class Features:
     """Landmarks of one stereo pair.
 
     Attributes:
-        detected: number of corners described in the left image.
         stereo: (N, 3) float64 left u, left v, right u, px.
         points: (N, 3) float64 metres.
         words: (N, 4) uint64 BRIEF-256.
@@ -363,7 +362,6 @@ def adjust_window(
         frame_of: (M,) the frame of each observation.
         point_of: (M,) the point of each observation.
         stereo: (M, 3) what it sees.
-        camera: the camera of all frames.
 
     Returns:
         Adjusted poses and points, and the mean squared residual per observation, px².

@@ -17,9 +17,7 @@ import numpy as np
 from engram import _core
 from engram.errors import ConfigError
 from engram_lab.bench.data import BenchData, load_bench_data
-from engram_lab.bench.plain import load_plain_pipeline
-from engram_lab.bench.report import BenchReport, Machine
-from engram_lab.bench.stage import time_stage
+from engram_lab.bench.stage import BenchReport, Machine, load_plain_pipeline, time_stage
 from engram_lab.bench.stages import STAGES
 
 Progress = Callable[[str, int, int], None]
@@ -47,12 +45,8 @@ def run_bench(
 
     Args:
         only: names in `STAGES`; None runs all.
-        repeats: timed runs of each side of a stage; slow ones are run less often.
         progress: called before each stage with its name, its number from 0, and how many.
         data: the frames; None takes KITTI 06 under ``$ENGRAM_DATA``, else a synthetic drive.
-
-    Raises:
-        ConfigError: a stage is unknown, or `repeats` is not positive.
     """
     names = list(STAGES) if only is None else [name for name in STAGES if name in only]
     unknown = set(only or ()) - set(STAGES)

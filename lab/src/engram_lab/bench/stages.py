@@ -3,27 +3,117 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import tempfile
 from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from engram.frontend.frame import StereoPair
+from engram.frontend.frame import Frame, StereoPair
 from engram.frontend.frontend import Frontend
+from engram.frontend.matching import MatcherConfig, match_frames
 from engram.geometry.cameras import StereoCamera
+from engram.geometry.se3 import SE3
+from engram.localiser.localisation import Position
+from engram.maps.map import Map, open_map
 from engram.odometry.odometry import Odometry, OdometryConfig, WindowConfig
-from engram_lab.bench.attempts import attempts_at, hopeless
-from engram_lab.bench.data import BenchData, to_and_fro
-from engram_lab.bench.opening import prepare_opening
-from engram_lab.bench.places import prepare_places_query, prepare_vocabulary_train
-from engram_lab.bench.plain import PlainPipeline
-from engram_lab.bench.ranking import prepare_ranking
-from engram_lab.bench.rendering import NIGHT, RAIN, prepare_rendering
-from engram_lab.bench.stage import Prepared, Run, Stage
-from engram_lab.bench.steps import prepare_step
-from engram_lab.bench.window import prepare_window
+from engram.robot.settings import Settings
+from engram.sequences.opening import open_drive
+from engram_lab.bench.data import BenchData, scale_and_crop, to_and_fro
+from engram_lab.bench.images import NIGHT, RAIN, prepare_rendering, prepare_window
+from engram_lab.bench.maps import (
+    prepare_opening,
+    prepare_places_query,
+    prepare_ranking,
+    prepare_vocabulary_train,
+)
+from engram_lab.bench.stage import PlainPipeline, Prepared, Run, Stage
+
+_OTHER_DRIVE = "kitti_raw/2011_09_26/2011_09_26_drive_0001_sync"
+
+
+def attempts_at(references: list[Frame], lives: list[Frame]) -> Run:
+    """Matches the i-th pair of frames, without a prediction."""
+    matcher = MatcherConfig()
+
+    def run(i: int) -> dict[str, int]:
+        at = i % min(len(references), len(lives))
+        match = match_frames(references[at], lives[at], matcher, seed=i)
+        return {"landmarks": len(references[at].landmarks), "inliers": match.inliers}
+
+    return run
+
+
+def hopeless(data: BenchData, *, size: str) -> Run:
+    """Attempts at frames of another street; without ENGRAM_DATA, of the same one seen mirrored."""
+    frontend = Frontend()
+    frames = [frontend.extract(pair) for pair in data.at(size)]
+    return attempts_at(frames, [frontend.extract(pair) for pair in _elsewhere(data, size)])
+
+
+def _elsewhere(data: BenchData, size: str) -> list[StereoPair]:
+    folder = Path(os.environ.get("ENGRAM_DATA", "")) / _OTHER_DRIVE
+    if not folder.is_dir():
+        return [_mirrored(pair) for pair in data.at(size)]
+    pairs = [pair for pair in open_drive(folder) if isinstance(pair, StereoPair)]
+    return [scale_and_crop(pair) for pair in pairs] if size == "512" else pairs
+
+
+def _mirrored(pair: StereoPair) -> StereoPair:
+    """What a mirror would show: right and left change places."""
+    left, right = (image[:, ::-1].copy() for image in (pair.right, pair.left))
+    return StereoPair(pair.stamp_ns, left, right, pair.camera)
+
+
+_PERIOD_NS = 100_000_000
+_MAPPED = 3  # every so many frames are the map
+
+
+def prepare_step(data: BenchData, plain: PlainPipeline | None, *, size: str) -> Prepared:
+    """`Robot.step` in a map of every third pair, two attempts a frame.
+
+    All included: front-end, odometry with its window, neighbourhood, ranking, both attempts, their
+    acceptance and confidence, and what the localiser remembers; not the doctor, who looks at the
+    first frames of a drive only. At the end of the drive the robot is put back to its begin.
+    """
+    del plain
+    pairs = data.at(size)
+    folder = tempfile.TemporaryDirectory(prefix="engram-bench-")  # lives as long as `ours`
+    path = Path(folder.name) / "street.engram"
+    with (
+        open_map(path, create=True) as opened,
+        opened.robot(pairs[0].camera, name="bench", maps=True) as mapper,
+    ):
+        for number in range(0, len(pairs), _MAPPED):
+            mapper.step(_at(number, pairs[number]))
+    opened = Map.open(path)
+    settings = Settings()
+    settings = dataclasses.replace(settings, doctor=dataclasses.replace(settings.doctor, frames=0))
+    robot = opened.robot(pairs[0].camera, settings, lanes=2, rounds=1)
+    begin = Position(opened.graph.node(0).id, SE3.identity(), 1e-4 * np.eye(6))
+
+    def ours(i: int) -> dict[str, int]:
+        at = i % len(pairs)
+        if at == 0:
+            robot.place_at(begin)
+        found = robot.step(_at(i, pairs[at]))
+        assert folder.name
+        return {
+            "attempts": found.attempts,
+            "candidates": found.candidates,
+            "inliers": found.inliers,
+        }
+
+    return Prepared(ours)
+
+
+def _at(number: int, pair: StereoPair) -> StereoPair:
+    return dataclasses.replace(pair, stamp_ns=(number + 1) * _PERIOD_NS)
+
 
 # Frames between the two of a localisation attempt: 3 to 4 m on the KITTI clip.
 _ATTEMPT_GAP = 3
@@ -148,6 +238,3 @@ def _plain_extract(
             break
         asked = round(asked * wanted / max(got, 1.0))
     return lambda pair: plain_frontend.extract(pair.left, pair.right)
-
-
-__all__ = ["STAGES", "Run", "prepare_attempt", "prepare_frontend_odometry"]

@@ -25,13 +25,7 @@ _LOOKS = 12  # kinds of weather and light; a path keeps to the experiences of it
 
 
 class SyntheticPlace:
-    """A stretch of road that many sessions drove, and contexts drawn from it.
-
-    Args:
-        path_count: paths in path memory.
-        experiences: nodes per metre of road.
-        seed: equal seeds make equal places.
-    """
+    """A stretch of road that many sessions drove, and contexts drawn from it."""
 
     def __init__(self, path_count: int, experiences: int = 60, seed: int = 0) -> None:
         self._rng = np.random.default_rng(seed)

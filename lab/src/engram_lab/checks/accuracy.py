@@ -2,6 +2,7 @@
 
 python -m engram_lab.checks.accuracy                       # all of them
 python -m engram_lab.checks.accuracy odometry basin --json results.json
+python -m engram_lab.checks.accuracy revisits seasons --kind net
 """
 
 from __future__ import annotations
@@ -9,18 +10,24 @@ from __future__ import annotations
 import csv
 import itertools
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from engram.frontend.frame import Frame, StereoPair
+from engram import _core
+from engram.frontend.features import feature_kind, fitted_matcher
+from engram.frontend.frame import BRIEF, DescriptorKind, Frame, StereoPair
 from engram.frontend.frontend import Frontend, FrontendConfig
 from engram.frontend.matching import Match, MatcherConfig, match_frames
 from engram.geometry.se3 import SE3
 from engram.odometry.odometry import Odometry, OdometryConfig
 from engram.sequences.opening import open_drive
+from engram_lab.accuracy import way_m
 from engram_lab.programs import Figure, command_line, report
 
 KITTI_06 = "kitti_odometry/sequences/06"
@@ -33,40 +40,78 @@ EUROC_AT_REST = "euroc/V1_01_easy_at_rest"
 MIN_INLIERS = 20
 NEAR_M = 0.25
 # Where camera 2 of KITTI's rig stands in camera 0, from its calibration.
-CAM0_FROM_CAM2_M = np.array([-0.0598, 0.0004, -0.0027])
+CAM0_FROM_CAM2 = SE3(np.eye(3), np.array([-0.0598, 0.0004, -0.0027]))
+# Of drive 0001: the half that no descriptor is trained on.
+_RIGS_FROM = 27
+# The shift of two pictures of one place counts as found within so many pixels (GRIEF).
+_SHIFT_PX, _VOTE_PX, _ROW_PX = 35, 15, 60
+_SEASON_CORNERS = 600
 
-
-def frames_of(folder: Path, **options: Any) -> list[Frame]:
-    frontend = Frontend(FrontendConfig(thumbnails=False))
-    pairs = open_drive(folder, **options)
-    return [frontend.extract(pair) for pair in pairs if isinstance(pair, StereoPair)]
+Pair = tuple[Frame, Frame, SE3]
 
 
 def kitti_truth(file: Path) -> list[SE3]:
     return [SE3.from_matrix(row.reshape(3, 4)) for row in np.loadtxt(file)]
 
 
-def match(reference: Frame, live: Frame) -> Match:
-    """An unguided attempt at the default threshold: no pose where it would not pass."""
-    found = match_frames(reference, live, MatcherConfig(), seed=live.stamp_ns % 2**63)
-    if found.inliers >= MIN_INLIERS:
-        return found
-    nothing = np.empty(0, np.int32)
-    return Match(None, None, found.inliers, nothing, nothing)
+@dataclass(frozen=True, slots=True, eq=False)
+class Eyes:
+    """A kind of features as it is judged, and the folder of the real images."""
+
+    data: Path = field(default_factory=lambda: Path(os.environ.get("ENGRAM_DATA", "")))
+    frontend: Frontend = field(default_factory=lambda: Frontend(FrontendConfig(thumbnails=False)))
+    matcher: MatcherConfig = field(default_factory=MatcherConfig)
+
+    @staticmethod
+    def of(name: str, second_threshold: int = FrontendConfig().second_threshold) -> Eyes:
+        """A kind by its name, with or without the front-end's second look."""
+        config = FrontendConfig(
+            descriptor=DescriptorKind(feature_kind(name).name),
+            second_threshold=second_threshold,
+            thumbnails=False,
+        )
+        matcher = fitted_matcher(MatcherConfig(), BRIEF, config.descriptor)
+        return Eyes(frontend=Frontend(config), matcher=matcher)
+
+    def frames(self, name: str, **options: Any) -> list[Frame]:
+        pairs = open_drive(self.data / name, **options)
+        return [self.frontend.extract(pair) for pair in pairs if isinstance(pair, StereoPair)]
+
+    def match(self, reference: Frame, live: Frame) -> Match:
+        """An unguided attempt at the default threshold: no pose where it would not pass."""
+        found = match_frames(reference, live, self.matcher, seed=live.stamp_ns % 2**63)
+        if found.inliers >= MIN_INLIERS:
+            return found
+        nothing = np.empty(0, np.int32)
+        return Match(None, None, found.inliers, nothing, nothing)
+
+    def errors_m(self, pairs: Sequence[Pair]) -> list[float | None]:
+        """Distance of each pose from the true one; None where nothing matches."""
+        return [error_m(self.match(a, b), a_from_b) for a, b, a_from_b in pairs]
 
 
-def error_of(found: Match, truth: SE3) -> tuple[float, float] | None:
+def error_m(found: Match, truth: SE3) -> float | None:
+    """Distance of a measured from the true position; None without a pose."""
     if found.reference_from_live is None:
         return None
-    wrong = found.reference_from_live @ truth.inverse()
-    direct = found.reference_from_live.translation - truth.translation
-    return float(np.linalg.norm(direct)), wrong.angle_rad
+    return float(np.linalg.norm(found.reference_from_live.translation - truth.translation))
 
 
-def odometry(data: Path) -> Iterator[Figure]:
+def _rated(name: str, errors_m: Sequence[float | None]) -> Iterator[Figure]:
+    passed = [one for one in errors_m if one is not None]
+    near = sum(one < NEAR_M for one in passed)
+    yield Figure(f"{name}, within {NEAR_M} m", 100 * near / len(errors_m), "%")
+    yield Figure("  passed but further off", len(passed) - near, "pairs")
+    if passed:
+        yield Figure("  error, median", 100 * float(np.median(passed)), "cm")
+        yield Figure("  error, worst", 100 * max(passed), "cm")
+
+
+def odometry(eyes: Eyes) -> Iterator[Figure]:
     """KITTI 06: drift over 10–50 m segments, and whether the covariance is honest."""
-    frames, truth = frames_of(data / KITTI_06), kitti_truth(data / KITTI_06_TRUTH)
-    steps = [step(frame) for step in [Odometry(OdometryConfig()).step] for frame in frames]
+    frames, truth = eyes.frames(KITTI_06), kitti_truth(eyes.data / KITTI_06_TRUTH)
+    engine = Odometry(OdometryConfig())
+    steps = [engine.step(frame) for frame in frames]
     poses, chi2 = [SE3.identity()], []
     for k, step in enumerate(steps[1:], start=1):
         if step.prev_from_curr is None or step.covariance is None:
@@ -74,30 +119,23 @@ def odometry(data: Path) -> Iterator[Figure]:
         poses.append(poses[-1] @ step.prev_from_curr)
         wrong = (step.prev_from_curr @ (truth[k - 1].inverse() @ truth[k]).inverse()).log()
         chi2.append(wrong @ np.linalg.solve(step.covariance, wrong))
-    translation, rotation = segment_errors(poses, truth)
+    translation, rotation = segment_errors(poses, truth[: len(poses)])
     yield Figure("translation over 10–50 m segments", 100 * translation, "%")
     yield Figure("rotation", np.degrees(rotation), "°/m")
     end = truth[-1].inverse() @ poses[-1]
-    length = sum((a.inverse() @ b).distance_m for a, b in itertools.pairwise(truth))
-    yield Figure("first to last frame", 100 * end.distance_m / length, "%")
+    yield Figure("first to last frame", 100 * end.distance_m / way_m(truth), "%")
     yield Figure("normalised error, root of mean χ²/6", float(np.sqrt(np.mean(chi2) / 6)))
     yield Figure("inliers, median", float(np.median([s.inliers for s in steps[1:]])))
 
 
 def segment_errors(poses: list[SE3], truth: list[SE3]) -> tuple[float, float]:
     """Mean translation error per metre, and rotation in rad/m, over all segments [KITTI devkit]."""
-    driven = np.concatenate(
-        [
-            [0],
-            np.cumsum([(a.inverse() @ b).distance_m for a, b in itertools.pairwise(truth)]),
-        ]
-    )
+    steps = [(a.inverse() @ b).distance_m for a, b in itertools.pairwise(truth)]
+    driven = np.concatenate([[0], np.cumsum(steps)])
     translation, rotation = [], []
-    for first in range(len(truth)):
-        for length_m in range(10, 51, 10):
-            last = int(np.searchsorted(driven, driven[first] + length_m))
-            if last >= len(truth):
-                break
+    for first, length_m in itertools.product(range(len(truth)), range(10, 51, 10)):
+        last = int(np.searchsorted(driven, driven[first] + length_m))
+        if last < len(truth):
             wrong = (poses[first].inverse() @ poses[last]).inverse() @ (
                 truth[first].inverse() @ truth[last]
             )
@@ -106,10 +144,10 @@ def segment_errors(poses: list[SE3], truth: list[SE3]) -> tuple[float, float]:
     return float(np.mean(translation)), float(np.mean(rotation))
 
 
-def rest(data: Path) -> Iterator[Figure]:
+def rest(eyes: Eyes) -> Iterator[Figure]:
     """EuRoC at rest: the motion that odometry sees where there is none."""
     engine, end, furthest = Odometry(), SE3.identity(), 0.0
-    for frame in frames_of(data / EUROC_AT_REST):
+    for frame in eyes.frames(EUROC_AT_REST):
         step = engine.step(frame)
         if step.prev_from_curr is not None:
             end = end @ step.prev_from_curr
@@ -118,128 +156,144 @@ def rest(data: Path) -> Iterator[Figure]:
     yield Figure("apparent motion, furthest", 1000 * furthest, "mm")
 
 
-def basin(data: Path) -> Iterator[Figure]:
+def basin(eyes: Eyes) -> Iterator[Figure]:
     """KITTI 06, full size: pairs so far apart along the road that match within 0.25 m."""
-    frames, truth = frames_of(data / KITTI_06), kitti_truth(data / KITTI_06_TRUTH)
+    frames, truth = eyes.frames(KITTI_06), kitti_truth(eyes.data / KITTI_06_TRUTH)
     for apart in range(1, 11):
-        passed, good = [], []
-        for k in range(len(frames) - apart):
-            error = error_of(
-                match(frames[k], frames[k + apart]), truth[k].inverse() @ truth[k + apart]
-            )
-            passed.append(error is not None)
-            good.append(error is not None and error[0] < NEAR_M)
-        distance = np.median(
-            [(a.inverse() @ b).distance_m for a, b in zip(truth, truth[apart:], strict=False)]
-        )
-        yield Figure(f"{distance:.1f} m apart, within {NEAR_M} m", 100 * float(np.mean(good)), "%")
-        false = sum(passed) - sum(good)
-        if false:
-            yield Figure(f"{distance:.1f} m apart, passed but further off", float(false), "pairs")
+        pairs = [
+            (frames[k], frames[k + apart], truth[k].inverse() @ truth[k + apart])
+            for k in range(len(frames) - apart)
+        ]
+        distance_m = np.median([a_from_b.distance_m for _, _, a_from_b in pairs])
+        yield from _rated(f"KITTI 06, {distance_m:.1f} m apart", eyes.errors_m(pairs))
 
 
-def even_odd(data: Path) -> Iterator[Figure]:
+def even_odd(eyes: Eyes) -> Iterator[Figure]:
     """KITTI 06: odd frames localised in the even frame nearest to them."""
-    frames, truth = frames_of(data / KITTI_06), kitti_truth(data / KITTI_06_TRUTH)
-    errors = []
+    frames, truth = eyes.frames(KITTI_06), kitti_truth(eyes.data / KITTI_06_TRUTH)
+    pairs = []
     for k in range(1, len(frames), 2):
         beside = [n for n in (k - 1, k + 1) if n < len(frames)]
         near = min(beside, key=lambda n: (truth[n].inverse() @ truth[k]).distance_m)
-        errors.append(error_of(match(frames[near], frames[k]), truth[near].inverse() @ truth[k]))
-    found = [error for error in errors if error is not None]
-    yield Figure("localised", 100 * len(found) / len(errors), "%")
-    yield Figure("error, median", 100 * float(np.median([e[0] for e in found])), "cm")
-    yield Figure("error, worst", 100 * max(e[0] for e in found), "cm")
+        pairs.append((frames[near], frames[k], truth[near].inverse() @ truth[k]))
+    errors = eyes.errors_m(pairs)
+    yield Figure("localised", 100 * sum(e is not None for e in errors) / len(errors), "%")
+    yield from _rated("KITTI 06, odd in even frames", errors)
 
 
-def revisits(data: Path) -> Iterator[Figure]:
+def revisits(eyes: Eyes) -> Iterator[Figure]:
     """EuRoC: the 85 revisits, unguided; and pairs that look in other directions."""
-    frames = {frame.stamp_ns: frame for frame in frames_of(data / EUROC)}
-    truth = {
-        int(row[0]): SE3.from_matrix(np.array(row[1:], dtype=float).reshape(3, 4))
-        for row in (
-            line.split()
-            for line in (data / EUROC / "poses_world_from_rectified_cam0.txt")
-            .read_text()
-            .splitlines()
-            if not line.startswith("#")
-        )
-    }
-    with (data / EUROC / "revisit_pairs.csv").open() as lines:
-        pairs = [(int(r["earlier_ns"]), int(r["later_ns"])) for r in csv.DictReader(lines)]
-    found = [error_of(match(frames[a], frames[b]), truth[a].inverse() @ truth[b]) for a, b in pairs]
-    passed = [error for error in found if error is not None]
-    near = sum(error[0] < NEAR_M for error in passed)
-    yield Figure("within 0.25 m", 100 * near / len(pairs), "%")
-    median_m = float(np.median([error[0] for error in passed]))
-    yield Figure("error, median of those that pass", 100 * median_m, "cm")
-    yield Figure("passed but further off", float(len(passed) - near), "pairs")
+    frames = {frame.stamp_ns: frame for frame in eyes.frames(EUROC)}
+    truth = euroc_truth(eyes.data / EUROC)
+    pairs = [
+        (frames[a], frames[b], truth[a].inverse() @ truth[b])
+        for a, b in euroc_revisits(eyes.data / EUROC)
+    ]
+    yield from _rated("EuRoC V1_01, revisits", eyes.errors_m(pairs))
     apart = [
         (a, b)
-        for a in frames
-        for b in frames
-        if a < b and truth[a].rotation[:, 2] @ truth[b].rotation[:, 2] < np.cos(np.radians(75))
+        for a, b in itertools.combinations(sorted(frames), 2)
+        if truth[a].rotation[:, 2] @ truth[b].rotation[:, 2] < np.cos(np.radians(75))
     ]
-    inliers = [match(frames[a], frames[b]).inliers for a, b in apart]
-    yield Figure(
-        f"pass, of {len(apart)} pairs with axes > 75° apart",
-        float(np.sum(np.array(inliers) >= MIN_INLIERS)),
-        "pairs",
-    )
-    yield Figure("most inliers among them", float(max(inliers)))
+    inliers = np.array([eyes.match(frames[a], frames[b]).inliers for a, b in apart])
+    falsely = int((inliers >= MIN_INLIERS).sum())
+    yield Figure(f"pass, of {len(apart)} pairs with axes > 75° apart", falsely, "pairs")
+    yield Figure("most inliers among them", int(inliers.max()))
 
 
-def cross_rig(data: Path) -> Iterator[Figure]:
+def euroc_truth(folder: Path) -> dict[int, SE3]:
+    """True poses of the rectified left camera, by stamp."""
+    lines = (folder / "poses_world_from_rectified_cam0.txt").read_text().splitlines()
+    rows = [line.split() for line in lines if not line.startswith("#")]
+    return {int(r[0]): SE3.from_matrix(np.array(r[1:], float).reshape(3, 4)) for r in rows}
+
+
+def euroc_revisits(folder: Path) -> list[tuple[int, int]]:
+    """Stamps of each pair of views of one place, ns."""
+    with (folder / "revisit_pairs.csv").open() as lines:
+        return [(int(r["earlier_ns"]), int(r["later_ns"])) for r in csv.DictReader(lines)]
+
+
+def cross_rig(eyes: Eyes) -> Iterator[Figure]:
     """Drive 0001: a map of the grey rig, the colour rig localised in it; then its blue channel."""
-    grey = frames_of(data / DRIVE_0001)
+    grey = eyes.frames(DRIVE_0001)
     for channel in ("grey", "blue"):
-        live = frames_of(data / DRIVE_0001, rig="colour", channel=channel)
-        found = [match(a, b) for a, b in zip(grey, live, strict=True)]
-        errors = [
-            float(np.linalg.norm(m.reference_from_live.translation - CAM0_FROM_CAM2_M))
-            for m in found
-            if m.reference_from_live is not None
-        ]
+        live = eyes.frames(DRIVE_0001, rig="colour", channel=channel)
+        pairs = [(a, b, CAM0_FROM_CAM2) for a, b in zip(grey, live, strict=True)]
         name = "colour rig" if channel == "grey" else "blue channel"
-        yield Figure(f"{name}, matched at the same instant", 100 * len(errors) / len(grey), "%")
-        yield Figure(
-            f"{name}, error of cam0_from_cam2, median",
-            100 * float(np.median(errors)),
-            "cm",
+        yield from _rated(f"{name} at the same instant", eyes.errors_m(pairs))
+        yield from _rated("  from frame 27 on", eyes.errors_m(pairs[_RIGS_FROM:]))
+
+
+def seasons(eyes: Eyes) -> Iterator[Figure]:
+    """Stromovka: five places on twelve visits until snow: which shift do matches vote for?"""
+    folder = eyes.data / "places/stromovka_12x5"
+    kind = feature_kind(eyes.frontend.config.descriptor)
+    seen = {}
+    for visit, place in itertools.product(range(1, 13), range(1, 6)):
+        image = cv2.imread(str(folder / f"images/{visit:02d}{place:02d}.jpg"), cv2.IMREAD_GRAYSCALE)
+        grey = np.ascontiguousarray(image, dtype=np.uint8)
+        pixels = _corners(grey, eyes.frontend)
+        octaves = np.zeros(len(pixels), np.uint8)
+        seen[visit, place] = pixels, kind.describe(grey, pixels, octaves)
+    truth = [np.loadtxt(folder / f"ground_truth/location_{place}.txt") for place in range(1, 6)]
+    found = {
+        (place, a, b): _shift_px(seen[a, place], seen[b, place])
+        for place in range(1, 6)
+        for a, b in itertools.combinations(range(1, 13), 2)
+    }
+    # The clip does not say which of two pictures its shifts are measured in.
+    best = max(
+        sum(
+            shift is not None and abs(shift - sign * truth[place - 1][a - 1, b - 1]) <= _SHIFT_PX
+            for (place, a, b), shift in found.items()
         )
-        yield Figure(f"{name}, inliers, median", float(np.median([m.inliers for m in found])))
+        for sign in (1, -1)
+    )
+    yield Figure("Stromovka, image pairs", float(100 * best / len(found)), "%")
 
 
-def wrong_places(data: Path) -> Iterator[Figure]:
-    """Inliers between places that have nothing to do with each other."""
-    street, room = frames_of(data / KITTI_06)[::5], frames_of(data / EUROC)[::6]
-    trams = frames_of(data / DRIVE_0001)[::5]
-    for name, a, b in (
-        ("KITTI 06 / drive 0001", street, trams),
-        ("KITTI 06 / EuRoC", street, room),
-        ("drive 0001 / EuRoC", trams, room),
-    ):
-        inliers = np.array([match(x, y).inliers for x in a for y in b])
-        yield Figure(
-            f"{name}: any consensus, of {len(inliers)}", 100 * float(np.mean(inliers > 0)), "%"
-        )
-        yield Figure(f"{name}: most inliers", float(inliers.max()))
+def _corners(image: NDArray[np.uint8], frontend: Frontend) -> NDArray[np.float32]:
+    config, (height, width) = frontend.config, image.shape
+    positions, scores, _ = _core.detect_corners(image, config.fast_threshold)
+    order = _core.order_corners(positions, scores, width, height, config.cell_px)
+    count = round(_SEASON_CORNERS * (image.size / (512 * 384)) ** 0.6)
+    return positions[order[:count]].astype(np.float32)
 
 
-PARTS: dict[str, Callable[[Path], Iterator[Figure]]] = {
+Described = tuple[NDArray[np.float32], NDArray[np.uint8]]
+
+
+def _shift_px(a: Described, b: Described) -> float | None:
+    """How far most of the mutual nearest neighbours moved sideways; None if too few do."""
+    distances = _core.hamming_matrix(a[1], b[1])
+    nearest, back = distances.argmin(1), distances.argmin(0)
+    rows = np.flatnonzero(back[nearest] == np.arange(len(nearest)))
+    across, down = (b[0][nearest[rows]] - a[0][rows]).T
+    across = across[np.abs(down) < _ROW_PX]
+    if len(across) < 3:
+        return None
+    candidates = np.arange(-600, 601, 4)
+    near = np.abs(across[None] - candidates[:, None]) < _VOTE_PX
+    best = candidates[near.sum(1).argmax()]
+    return float(np.median(across[np.abs(across - best) < _VOTE_PX]))
+
+
+PARTS: dict[str, Callable[[Eyes], Iterator[Figure]]] = {
     "odometry": odometry,
     "rest": rest,
     "basin": basin,
     "even_odd": even_odd,
     "revisits": revisits,
     "cross_rig": cross_rig,
-    "wrong_places": wrong_places,
+    "seasons": seasons,
 }
 
 
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
+    parser.add_argument("--kind", default="brief", help="of features")
     asked = parser.parse_args()
     if unknown := set(asked.parts) - set(PARTS):
         parser.error(f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(PARTS)}")
@@ -247,7 +301,7 @@ def main() -> None:
         parser.error("set ENGRAM_DATA to the folder of the real images")
     for part in asked.parts or PARTS:
         title = f"{part}: {(PARTS[part].__doc__ or '').splitlines()[0]}"
-        report(PARTS[part](Path(os.environ["ENGRAM_DATA"])), asked.json, title)
+        report(PARTS[part](Eyes.of(asked.kind)), asked.json, title)
 
 
 if __name__ == "__main__":

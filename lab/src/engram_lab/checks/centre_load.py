@@ -36,8 +36,8 @@ from engram.fleet.centre.access import new_code
 from engram.fleet.centre.service import Centre, MapPolicy
 from engram.fleet.merge.merge_settings import MergeOptions
 from engram.maps.map import open_map
-from engram_lab.checks.merge_scaling import SESSION_NODES, write_map, write_session
 from engram_lab.programs import Figure, command_line, report
+from engram_lab.synthetic_places import SESSION_NODES, write_map, write_session
 
 _MAP = "fleet"
 _FORAY_NODES = 20
@@ -52,7 +52,7 @@ def made_centre(folder: Path, nodes: int) -> Centre:
     centre = Centre(folder)
     if nodes:
         places = [range(at, at + SESSION_NODES) for at in range(0, nodes, SESSION_NODES)]
-        write_map(folder / "maps" / f"{_MAP}.engram", "fleet", places, None)
+        write_map(folder / "maps" / f"{_MAP}.engram", "fleet", places)
     centre.add_map(_MAP, "lab", MapPolicy(merge=MergeOptions(relocaliser="none")))
     return centre
 
@@ -74,13 +74,7 @@ def served(folder: Path) -> Iterator[str]:
 
 
 class Day:
-    """Agents that drive and hand in until the day is over.
-
-    Attributes:
-        troubles: what went wrong for an agent, in words; a day without any has none.
-        forays: how many were handed in.
-        seen_s: time of each answer as its agent saw it, from asking to the answer's head.
-    """
+    """Agents that drive and hand in until the day is over."""
 
     def __init__(self, folder: Path, url: str, minutes: float, forays: float) -> None:
         self._folder = folder
@@ -136,7 +130,7 @@ def drive(path: Path, robot: str, number: int, places: range) -> None:
         store.writing(),
         store.begin_revision(author=robot, message="", configuration={}) as writer,
     ):
-        write_session(writer, robot, number, places, None)
+        write_session(writer, robot, number, places)
         writer.commit()
 
 

@@ -36,12 +36,12 @@ from engram.robot.settings import Settings
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.studies.faults.clips import DOCTORED
 from engram_lab.studies.faults.injected import (
-    Frozen,
-    LateSide,
     blurred,
     brightened,
     exchanged,
+    frozen,
     halved,
+    late_side,
     lowered,
     on_both,
     turned,
@@ -61,9 +61,6 @@ class Window:
     """Some frames of a drive.
 
     Attributes:
-        name: of clip and window.
-        rig: whose camera.
-        pairs: its frames.
         truth: world_from_cam of each; empty if unknown.
     """
 
@@ -81,15 +78,7 @@ Inject = Callable[[Window, float, np.random.Generator], list[StereoPair]]
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A fault that the doctor should find.
-
-    Attributes:
-        codes: findings that count as found.
-        least, most: strengths drawn, in `unit`; equal for faults that have none.
-        unit: of the strength.
-        inject: makes the faulty drive.
-        clock: what is known of the clock.
-    """
+    """A fault that the doctor should find."""
 
     codes: tuple[str, ...]
     least: float
@@ -105,12 +94,12 @@ def _each(change: Callable[[StereoPair, float], StereoPair]) -> Inject:
 
 def _frozen(*sides: str) -> Inject:
     return lambda window, frames, rng: [
-        one.pair for one in Frozen(sides).apply(window.pairs, frames, 6, rng)
+        one.pair for one in frozen(window.pairs, frames, 6, rng, sides)
     ]
 
 
 def _late(window: Window, frames: float, rng: np.random.Generator) -> list[StereoPair]:
-    shown = LateSide().apply(window.pairs, frames, 0, rng)
+    shown = late_side(window.pairs, frames, 0, rng)
     return [one.pair for one in shown[round(frames) :]]
 
 

@@ -21,20 +21,18 @@ from numpy.typing import NDArray
 
 from engram import _core
 from engram.cli.screen import Bars
-from engram.frontend.features import NET, FeatureKind, detect_corners, feature_kind, fitted_matcher
-from engram.frontend.frame import BRIEF, Frame
-from engram.frontend.frontend import Frontend, FrontendConfig
-from engram.frontend.matching import Match, MatcherConfig, match_frames
+from engram.frontend.features import NET, FeatureKind, detect_corners, feature_kind
+from engram.frontend.frame import Frame
 from engram.geometry.se3 import SE3
 from engram.monitor import Monitor, write_whole
 from engram.places.recognisers import FabMap, PlaceRecogniser, Signatures
 from engram.places.vocabulary import default_vocabulary
-from engram_lab.checks import eyes_real
+from engram_lab.checks.accuracy import MIN_INLIERS, NEAR_M, PARTS, Eyes, error_m
 from engram_lab.eyes import Scene, judged_scene, training_scene
 from engram_lab.programs import command_line
 
-LEAST_INLIERS = 20
-WITHIN_M = 0.25
+# Parts of `checks.accuracy` that depend on the features.
+REAL = ("revisits", "basin", "odometry", "cross_rig", "seasons")
 PAIRS = (
     ("morning", "late afternoon"),
     ("morning", "night"),
@@ -50,62 +48,21 @@ TOWNS = ((1, 4), (2, 301))
 # Two towns that nothing else uses: random visits of a place, and places of different towns.
 CALIBRATION = (207, 208)
 _RANDOM, _SAME, _OTHER = 3000, 500, 6000
-_SEED = 7
 
 
-@dataclass(frozen=True, slots=True)
-class Eyes:
-    """A kind of features as it is judged.
-
-    Attributes:
-        kind: of the table.
-        matcher: its matcher settings.
-        frontend: makes its frames.
-    """
-
-    kind: FeatureKind
-    matcher: MatcherConfig
-    frontend: Frontend
-
-    @staticmethod
-    def of(name: str, second_threshold: int = FrontendConfig().second_threshold) -> Eyes:
-        """A kind by its name, with or without the front-end's second look."""
-        kind = feature_kind(name)
-        config = FrontendConfig(
-            descriptor=kind.name, second_threshold=second_threshold, thumbnails=False
-        )
-        return Eyes(kind, fitted_matcher(MatcherConfig(), BRIEF, kind.name), Frontend(config))
-
-    def match(self, reference: Frame, live: Frame) -> Match:
-        """Searches the whole frame."""
-        return match_frames(reference, live, self.matcher, _SEED)
+def kind_of(eyes: Eyes) -> FeatureKind:
+    return feature_kind(eyes.frontend.config.descriptor)
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One figure of one kind.
-
-    Attributes:
-        where: towns or clip.
-        what: compared.
-        value: measured.
-        of: how many could be.
-        wrong: matches with a wrong pose.
-    """
+    """One figure of one kind."""
 
     where: str
     what: str
     value: float
     of: float = 100.0
     wrong: int = 0
-
-
-def error_m(match: Match, reference_from_live: SE3) -> float:
-    """Distance of a measured from the true position; infinite without a pose."""
-    if match.reference_from_live is None:
-        return float("inf")
-    off = match.reference_from_live.translation - reference_from_live.translation
-    return float(np.linalg.norm(off))
 
 
 def town_rows(eyes: Eyes, seeds: Sequence[int], monitor: Monitor) -> Iterator[Row]:
@@ -120,14 +77,14 @@ def town_rows(eyes: Eyes, seeds: Sequence[int], monitor: Monitor) -> Iterator[Ro
                 match = eyes.match(seen[a, place], seen[b, place])
                 off_m = error_m(match, between(scene, (a, place), (b, place)))
                 places += 1
-                if match.inliers >= LEAST_INLIERS:
-                    right, wrong = right + (off_m < WITHIN_M), wrong + (off_m >= WITHIN_M)
+                if off_m is not None:
+                    right, wrong = right + (off_m < NEAR_M), wrong + (off_m >= NEAR_M)
         yield Row(where, f"{a} / {b}", right, places, wrong)
     yield from place_rows(eyes, where, frames)
     draws = np.random.default_rng(11)
     pairs = [tuple(draws.choice(len(seeds), 2, replace=False)) for _ in range(_RANDOM)]
     falsely = sum(
-        eyes.match(_any(frames[a], draws), _any(frames[b], draws)).inliers >= LEAST_INLIERS
+        eyes.match(_any(frames[a], draws), _any(frames[b], draws)).inliers >= MIN_INLIERS
         for a, b in pairs
     )
     yield Row(where, "false accepts between the two towns", falsely, _RANDOM)
@@ -137,9 +94,9 @@ def place_rows(
     eyes: Eyes, where: str, frames: Sequence[Mapping[tuple[str, int], Frame]]
 ) -> Iterator[Row]:
     """Of single images of a visit, how many a recogniser finds among the morning's places."""
-    vocabulary = default_vocabulary(eyes.kind.name)
+    vocabulary = default_vocabulary(kind_of(eyes).name)
     by_words, by_signature = FabMap(vocabulary), None
-    if eyes.kind.name == NET:
+    if kind_of(eyes).name == NET:
         by_signature = Signatures(vocabulary)
 
     def words(frame: Frame) -> NDArray[np.int32]:
@@ -210,7 +167,7 @@ def calibration_rows(eyes: Eyes, monitor: Monitor) -> Iterator[Row]:
         place = int(draws.integers(scene.left.shape[1]))
         match = eyes.match(frames[town][a, place], frames[town][b, place])
         off_m = error_m(match, between(scene, (a, place), (b, place)))
-        right.append(match.inliers if off_m < WITHIN_M else 0)
+        right.append(match.inliers if off_m is not None and off_m < NEAR_M else 0)
     falsely = [
         eyes.match(_any(frames[0], draws), _any(frames[1], draws)).inliers for _ in range(_OTHER)
     ]
@@ -232,7 +189,7 @@ def speed_rows(eyes: Eyes, monitor: Monitor) -> Iterator[Row]:
         pair = scene.pair(0, place)
         times_s: tuple[list[float], list[float]] = ([], [])
         for _ in range(20):
-            for times, detect in zip(times_s, (detect_corners, eyes.kind.detect), strict=True):
+            for times, detect in zip(times_s, (detect_corners, kind_of(eyes).detect), strict=True):
                 began = time.thread_time()
                 detect(pair, config, 600)
                 times.append(time.thread_time() - began)
@@ -247,10 +204,10 @@ def rows_of(eyes: Eyes, monitor: Monitor) -> Iterator[Row]:
         yield from town_rows(eyes, seeds, monitor)
     yield from calibration_rows(eyes, monitor)
     yield from speed_rows(eyes, monitor)
-    if data := os.environ.get("ENGRAM_DATA"):
-        for judge in eyes_real.CLIPS:
-            for what, value, of, wrong in judge(eyes.frontend, eyes.match, Path(data)):
-                yield Row("real", what, value, of, wrong)
+    if os.environ.get("ENGRAM_DATA"):
+        for name in REAL:
+            for one in PARTS[name](eyes):
+                yield Row("real", f"{name}: {one.name.strip()}, {one.unit}", one.value)
 
 
 def table(found: Mapping[str, Sequence[Row]]) -> str:

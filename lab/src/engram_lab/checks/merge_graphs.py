@@ -82,13 +82,7 @@ SIGMA = np.diag([0.02**2] * 3 + [0.003**2] * 3)
 
 @dataclass
 class RandomMap:
-    """What one robot hands in, as records.
-
-    Attributes:
-        sessions: its drives.
-        nodes: with place and appearance of each.
-        edges, entries, attempts: between them; attempts by session.
-    """
+    """What one robot hands in, as records."""
 
     sessions: list[Session] = field(default_factory=list)
     nodes: dict[NodeId, tuple[Node, int, int]] = field(default_factory=dict)
@@ -247,12 +241,7 @@ def remembered(path: Path) -> Counter[tuple[SessionId, int, int, bool, int]]:
 
 @dataclass
 class Case:
-    """What one case came to.
-
-    Attributes:
-        violations: in words.
-        sent: by which policy a download was made; "" where nothing fitted it.
-    """
+    """What one case came to."""
 
     violations: list[str]
     sent: str = ""

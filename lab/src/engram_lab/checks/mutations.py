@@ -26,28 +26,28 @@ from pathlib import Path
 
 import cv2
 
-from engram_lab.mutations import bytewise, definitions, handins, rowwise, texts
+from engram_lab.mutations import case as cases
+from engram_lab.mutations import files, handins
 from engram_lab.mutations.case import Case, Change, Samples, Subject, make_samples
-from engram_lab.mutations.forks import OF_TEXTS, Outcome, Tell, Trial, tried
-from engram_lab.mutations.reading import Held, held, read
+from engram_lab.mutations.forks import OF_TEXTS, Held, Outcome, Tell, Trial, held, read, tried
 from engram_lab.programs import Figure, command_line, report
 
 TEXTS: dict[str, Change] = {
-    "text of a calibration": texts.of_a_calibration,
-    "text of settings": texts.of_settings,
-    "name of a zone": texts.of_a_zone,
+    "text of a calibration": cases.of_a_calibration,
+    "text of settings": cases.of_settings,
+    "name of a zone": cases.of_a_zone,
 }
 CHANGES: dict[str, Change] = {
-    "bytes of a map": bytewise.of_a_map,
-    "bytes of a map with a log": bytewise.of_a_map_with_a_log,
-    "bytes of a log": bytewise.of_a_log,
-    "rows of a map": rowwise.of_a_map,
-    "sealed rows of a map": rowwise.sealed_in_a_map,
-    "blobs of a map": rowwise.blobs_of_a_map,
-    "many rows of a map": rowwise.many_rows,
-    "schema": definitions.of_a_file,
-    "bytes of a drive": bytewise.of_a_drive,
-    "rows of a drive": rowwise.of_a_drive,
+    "bytes of a map": files.bytes_of_a_map,
+    "bytes of a map with a log": files.bytes_of_a_map_with_a_log,
+    "bytes of a log": files.bytes_of_a_log,
+    "rows of a map": files.rows_of_a_map,
+    "sealed rows of a map": files.sealed_rows_of_a_map,
+    "blobs of a map": files.blobs_of_a_map,
+    "many rows of a map": files.many_rows,
+    "schema": files.schema_of_a_file,
+    "bytes of a drive": files.bytes_of_a_drive,
+    "rows of a drive": files.rows_of_a_drive,
     "pages of a hand-in": handins.pages,
     "rows of a hand-in": handins.rows,
     "manifests": handins.manifests,
@@ -59,12 +59,7 @@ FAULTS = frozenset(Outcome) - {Outcome.READ, Outcome.REFUSED}
 
 
 class Harness:
-    """Sound files, and what they hold.
-
-    Args:
-        folder: for them and for each changed one in turn.
-        changes: kinds of changes by name.
-    """
+    """Sound files, and what they hold."""
 
     def __init__(self, folder: Path, changes: Mapping[str, Change] = CHANGES) -> None:
         self._folder = folder
@@ -107,7 +102,7 @@ class Harness:
                 if not read(replace(case, path=copy), Path(folder), merges=True):
                     raise AssertionError(f"a sound {case.subject} does not pass its check")
 
-        for case in texts.sound(self._folder):
+        for case in cases.sound(self._folder):
             if not read(case, self._folder, merges=False):
                 raise AssertionError(f"the sound {case.what} is refused")
 

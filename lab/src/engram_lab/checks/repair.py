@@ -2,7 +2,6 @@
 
     laps=3,13,23,33
     engram lab simulate begbroke24h --seed 2 --sessions $laps
-    python -m engram_lab.checks.map_truth begbroke24h --seed 2 --out t2.engram --sessions $laps
     python -m engram_lab.checks.repair t2.engram --campaign begbroke24h@2 --plant 20
 
 Each false join is a match that the matcher itself makes between two places that look alike, held to
@@ -36,6 +35,8 @@ from engram.maps.map_frame import graph_of
 from engram.places.recognisers import BagOfWords
 from engram.places.words import vocabulary_or_default, words_of
 from engram.repair.finding import RepairConfig, find_wrong_edges, is_measured
+from engram.robot.mapping import map_drive
+from engram.sequences.opening import open_drive
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.studies.drives import TrueNodes, campaign_logs, drives_of
 from engram_lab.town.campaigns import campaign_named
@@ -50,14 +51,7 @@ _STRETCH_M, _SPACING_M = 12.0, 8.0
 
 @dataclass
 class Town:
-    """A map with its truth, and what is planted in it.
-
-    Attributes:
-        opened: the map.
-        true: true poses of its nodes.
-        planted: the false edges.
-        dropped: indices of edges that are left out, so that stretches hang on a false edge.
-    """
+    """A map with its truth, and what is planted in it."""
 
     opened: Map
     true: TrueNodes
@@ -252,6 +246,9 @@ def main() -> None:
             if log.with_suffix(".truth.txt").exists()
         ]
         truths = {drive.session.id: drive.truth() for drive in drives_of(logs)}
+        if not path.exists():
+            for log in logs:
+                map_drive(path, open_drive(log))
         with Map.open(path) as opened:
             town = Town(opened, TrueNodes(opened, truths))
             plant(town, share, rng)

@@ -1,16 +1,10 @@
-"""Whether a step costs the same after hours of driving, and in a large map.
+"""Whether a step costs the same after hours of driving.
 
     python -m engram_lab.checks.soak localising --frames 7000     # 3 minutes
-    python -m engram_lab.checks.soak mapping --nodes 20000        # 5 minutes
     python -m engram_lab.checks.soak logged --frames 1000000 --nodes 4000 --logs HOME OTHER…
 
 Localising: the bench's clip is driven there and back, image by image, in a map of itself. Then a
 fresh robot takes the same frames, in blocks that alternate with those of the old one.
-
-Mapping: a road of five lanes, 3 m apart and tied to each other, is a map of so many nodes. A robot
-maps another lane, of frames that match none of theirs: every frame has the lanes beside it as
-candidates. A second one does the same on a short road, in blocks that alternate. Place recognition
-is off unless --relocaliser names one: it looks every node up among all places.
 
 Logged: the first eight frame logs of folder HOME, drives of one town, become a map as usual. All
 others are added by robots that cannot relocalise, which save all they see, until the map has so
@@ -31,13 +25,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
-from engram.frontend.blobs import quantised_landmarks
-from engram.frontend.frame import Frame, FrameStatus, StereoPair
-from engram.geometry.se3 import SE3
-from engram.graph.model import Edge, EdgeKind, Node, NodeId
-from engram.localiser.localisation import Position
+from engram.frontend.frame import StereoPair
 from engram.maps.map import Map, open_map
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.robot.mapping import map_drive
@@ -47,15 +35,6 @@ from engram.sequences.opening import open_drive
 from engram.sequences.sequence import LoggedFrame
 from engram_lab.bench.data import load_bench_data
 from engram_lab.programs import Figure, command_line, report
-from engram_lab.synthetic_places import (
-    CAMERA,
-    DESCRIPTOR,
-    FRONTEND,
-    drive_of,
-    landmark_bytes,
-    node_of,
-    stored,
-)
 
 _PERIOD_NS = 100_000_000
 _BLOCK = 50  # frames
@@ -63,12 +42,6 @@ _BLOCKS = 16  # of each robot
 _WARM = 100  # frames of a fresh robot before it is timed
 _AT_HOME = 8  # logs of the town whose map is used
 _REPORTED = 50_000  # frames between two reports of memory
-
-_LANES, _APART_M, _TIED_EVERY = 5, 3.0, 4
-_LANDMARKS = 200
-_STEP_M = 0.2  # 2 m/s at 10 Hz: every fifth frame is saved
-_SHARP = np.diag([0.01**2] * 3 + [0.0005**2] * 3)
-_STEP_COVARIANCE = np.diag([0.002**2] * 3 + [2e-5**2] * 3)
 
 
 def localising(frames: int) -> Iterator[Figure]:
@@ -161,63 +134,6 @@ def there_and_back(entries: Sequence[LoggedFrame]) -> Callable[[int], LoggedFram
     return frame_at
 
 
-def mapping(nodes: int, few: int, relocaliser: str | None) -> Iterator[Figure]:
-    """A mapped frame in a map of so many nodes ÷ one in a map of few."""
-    with tempfile.TemporaryDirectory(prefix="engram-soak-") as folder:
-        robots = []
-        for count in (nodes, few):
-            path = Path(folder) / f"{count}.engram"
-            beside = write_road(path, count)
-            with Map.open(path) as opened:
-                robot = opened.robot(CAMERA, name="soak", maps=True, relocaliser=relocaliser)
-            robot.place_at(Position(beside, SE3(np.eye(3), np.array([1.5, 0, 0])), _SHARP))
-            robots.append(robot)
-            drive(robot, lane_frame, range(_WARM))
-        large, small = robots
-        yield Figure("candidates of the last frame", large.step(lane_frame(_WARM)).candidates)
-        small.step(lane_frame(_WARM))
-        yield from compared(
-            lambda first: drive(large, lane_frame, range(first, first + _BLOCK)),
-            lambda first: drive(small, lane_frame, range(first, first + _BLOCK)),
-            _WARM + 1,
-            f"at {nodes:,} nodes",
-            f"at {few:,}",
-        )
-        yield Figure("nodes saved", large.saving.nodes)
-        for robot in robots:
-            robot.close()
-
-
-def write_road(path: Path, nodes: int) -> NodeId:
-    """A map of five lanes; returns the node of the middle one where the robot begins."""
-    length = nodes // _LANES
-    blob = landmark_bytes(np.random.default_rng(0), None, _LANDMARKS)
-    ahead = SE3(np.eye(3), np.array([0.0, 0.0, 1.0]))
-    aside = SE3(np.eye(3), np.array([_APART_M, 0.0, 0.0]))
-    lanes: list[list[Node]] = []
-    with (
-        Map.create(path) as store,
-        store.begin_revision(author="soak", message="a road", configuration={}) as writer,
-    ):
-        for lane in range(_LANES):
-            start_ns = 10**12 * (lane + 1)
-            session = drive_of("soak", start_ns)
-            writer.add_session(session, CAMERA, descriptor=DESCRIPTOR, frontend=FRONTEND)
-            saved = [node_of(session, start_ns + at * _PERIOD_NS, at) for at in range(length)]
-            for at, node in enumerate(saved):
-                writer.copy_node(stored(node, blob))
-                if at:
-                    kind = EdgeKind.ODOMETRY
-                    writer.add_edge(Edge(saved[at - 1].id, node.id, kind, ahead, _SHARP))
-                if lanes and at % _TIED_EVERY == 0:
-                    kind = EdgeKind.PROXIMITY
-                    writer.add_edge(Edge(lanes[-1][at].id, node.id, kind, aside, _SHARP))
-            lanes.append(saved)
-        writer.commit()
-    # In the middle of a long road; a short one is just long enough.
-    return lanes[_LANES // 2][max(2, length // 2 - 100)].id
-
-
 def drive(
     robot: Robot, frame_at: Callable[[int], StereoPair | LoggedFrame], numbers: range
 ) -> float:
@@ -248,28 +164,6 @@ def compared(
         yield Figure(f"ratio, {name}", value)
 
 
-def lane_frame(number: int) -> LoggedFrame:
-    """A frame like no other, a step farther along the lane."""
-    draws = np.random.default_rng(number)
-    camera = CAMERA
-    pixels = draws.uniform([20, 20], [620, 460], (_LANDMARKS, 2)).astype(np.float32)
-    disparity_px = draws.uniform(4, 40, _LANDMARKS).astype(np.float32)
-    landmarks = quantised_landmarks(
-        pixels,
-        disparity_px,
-        np.full(_LANDMARKS, 0.1, np.float32),
-        draws.integers(0, 256, (_LANDMARKS, 32), np.uint8),
-        np.zeros(_LANDMARKS, np.uint8),
-        camera,
-    )
-    stamp_ns = (number + 1) * _PERIOD_NS
-    frame = Frame(stamp_ns, camera, landmarks, DESCRIPTOR, FRONTEND, FrameStatus.OK)
-    if number == 0:
-        return LoggedFrame(frame, OdometryStep(OdometryStatus.FIRST))
-    motion = SE3(np.eye(3), np.array([0.0, 0.0, _STEP_M]))
-    return LoggedFrame(frame, OdometryStep(OdometryStatus.OK, motion, _STEP_COVARIANCE, _LANDMARKS))
-
-
 def resident_mb() -> float:
     """Memory of the process, MB."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
@@ -278,17 +172,13 @@ def resident_mb() -> float:
 
 def main() -> None:
     parser = command_line(__doc__)
-    parser.add_argument("what", choices=("localising", "mapping", "logged"))
+    parser.add_argument("what", choices=("localising", "logged"))
     parser.add_argument("--logs", nargs="+", type=Path, help="folders of frame logs, HOME first")
     parser.add_argument("--frames", type=int, default=7000)
-    parser.add_argument("--nodes", type=int, default=20_000)
-    parser.add_argument("--few", type=int, default=1_000)
-    parser.add_argument("--relocaliser", help="of the mapping robots; none if left out")
+    parser.add_argument("--nodes", type=int, default=4_000)
     given = parser.parse_args()
     if given.what == "localising":
         figures = localising(given.frames)
-    elif given.what == "mapping":
-        figures = mapping(given.nodes, given.few, given.relocaliser)
     elif given.logs:
         figures = logged(given.frames, given.nodes, given.logs[0], given.logs[1:])
     else:

@@ -4,6 +4,7 @@
     python -m engram_lab.checks.town_accuracy drift [--campaigns DIR]         # all laps, seconds
     python -m engram_lab.checks.town_accuracy disparity --laps 1,4,7          # a minute or so a lap
     python -m engram_lab.checks.town_accuracy disparity --laps 1 --every 40
+    python -m engram_lab.checks.town_accuracy rain [--towns 1,4] [--second 0,3]
 
 Drift is KITTI's measure: the error over stretches of 100, 200 and 300 m ÷ their length, one from
 every tenth frame on; the median of each lap, and the median over laps by day and at night.
@@ -14,28 +15,37 @@ the truth at the pixel's centre is the other one's as often as not. So the neare
 there stands on an edge (truths within 3×3 pixels that differ by more than a pixel of disparity). A
 corner of the half-size image is known to two pixels, and its disparity is that of the surface which
 fills most of its window: the share with the right truth within 9×9 pixels tells errors from edges.
+
+Rain: landmarks of hard rain and of rain at night with a right disparity, with and without a second
+look at frames that have few.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.frontend.frontend import Frontend
+from engram.cli.screen import Bars
+from engram.frontend.frame import Landmarks
+from engram.frontend.frontend import Frontend, FrontendConfig
+from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram.sequences.framelog.reader import FrameLog
-from engram_lab.programs import command_line
+from engram_lab.eyes import JUDGED, Scene, judged_scene
+from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.town.campaigns import Campaign, campaign_named
 from engram_lab.town.conditions import Conditions
+from engram_lab.town.rendering import Places
 from engram_lab.town.session import SimulatedDrive
 from engram_lab.town.simulating import campaign_folder, campaigns_folder
 from engram_lab.truth import read_truth
 
 STRETCHES_M = (100.0, 200.0, 300.0)
+_RAINY = ("rain", "rain again", "rain at night", "fog", "morning")
 
 
 def drift(campaign: Campaign, campaigns: Path) -> None:
@@ -139,19 +149,61 @@ def frame_disparity(
     return found_px - near[4], least(near), least(truths(4)), near.max(0) - near.min(0)
 
 
+_WITHIN_PX, _AROUND_PX = 1.0, 2
+
+
+def right_ones(marks: Landmarks, depth_m: NDArray[np.float32], camera: StereoCamera) -> int:
+    """How many landmarks have a right disparity."""
+    height, width = depth_m.shape
+    u, v = np.rint(marks.pixels).astype(int).T
+    shifts = np.arange(-_AROUND_PX, _AROUND_PX + 1)
+    rows = np.clip(v + shifts[:, None, None], 0, height - 1)
+    columns = np.clip(u + shifts[None, :, None], 0, width - 1)
+    true_px = camera.focal_baseline / depth_m[rows, columns]
+    low, high = true_px.min((0, 1)) - _WITHIN_PX, true_px.max((0, 1)) + _WITHIN_PX
+    return int(((marks.disparity_px > low) & (marks.disparity_px < high)).sum())
+
+
+def rain(town: int, seconds: Sequence[int]) -> Iterator[Figure]:
+    """Mean numbers of landmarks, and of right ones, of each visit of a judged town."""
+    scene, places = judged_scene(town, Bars()), Places(town)
+    for name in _RAINY:
+        row = scene.visits.index(name)
+        poses = [SE3.from_matrix(pose) for pose in scene.world_from_cam[row]]
+        depths_m = places.depths_m(JUDGED[name], poses)
+        for second in seconds:
+            config = FrontendConfig(second_threshold=second, thumbnails=False)
+            found = list(_counted(scene, row, depths_m, Frontend(config)))
+            every, right = np.mean(found, axis=0)
+            title = f"town {town}, {name}, second look {second or 'off'}"
+            yield Figure(f"{title}: landmarks", round(float(every), 1))
+            yield Figure(f"{title}: right", round(float(right), 1))
+
+
+def _counted(
+    scene: Scene, row: int, depths_m: list[NDArray[np.float32]], frontend: Frontend
+) -> Iterator[tuple[int, int]]:
+    for place, depth_m in enumerate(depths_m):
+        marks = frontend.extract(scene.pair(row, place)).landmarks
+        yield len(marks), right_ones(marks, depth_m, scene.camera)
+
+
 def main() -> None:
-    """Reads the command line."""
     parser = command_line(__doc__)
-    parser.add_argument("what", choices=("drift", "disparity"))
+    parser.add_argument("what", choices=("drift", "disparity", "rain"))
     parser.add_argument("--campaigns", type=Path, default=campaigns_folder())
-    parser.add_argument("--laps", default="1,4,7", help="numbers, joined by commas")
+    parser.add_argument("--laps", type=numbers, default=[1, 4, 7], help="joined by commas")
     parser.add_argument("--every", type=int, default=20, help="frames between those looked at")
+    parser.add_argument("--towns", type=numbers, default=[1, 4], help="judged towns of rain")
+    parser.add_argument("--second", type=numbers, default=[0, 3], help="thresholds; 0: none")
     asked = parser.parse_args()
     village = campaign_named("village")
     if asked.what == "drift":
         drift(village, asked.campaigns)
+    elif asked.what == "disparity":
+        disparity(village, asked.laps, asked.every)
     else:
-        disparity(village, [int(one) for one in asked.laps.split(",")], asked.every)
+        report((one for town in asked.towns for one in rain(town, asked.second)), asked.json)
 
 
 if __name__ == "__main__":

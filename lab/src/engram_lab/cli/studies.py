@@ -19,15 +19,11 @@ from engram.errors import ConfigError
 if TYPE_CHECKING:
     from engram.robot.settings import Settings
     from engram_lab.studies.drives import DriveSet
-    from engram_lab.studies.faults.table import Asked
+    from engram_lab.studies.faults.questions import Asked
 
 
 def numbers(text: str, option: str) -> tuple[int, ...]:
-    """Whole numbers joined by commas, in their order.
-
-    Raises:
-        ConfigError: one is not a whole number.
-    """
+    """Whole numbers joined by commas, in their order."""
     try:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
@@ -465,9 +461,8 @@ def faults(
     from platformdirs import user_cache_path
 
     from engram.cli.settings import read_settings
-    from engram_lab.studies.faults.questions import QUESTIONS
+    from engram_lab.studies.faults.questions import QUESTIONS, Asked
     from engram_lab.studies.faults.staging import KINDS
-    from engram_lab.studies.faults.table import Asked
     from engram_lab.studies.streets import HELD_OUT_TOWNS
 
     names = only.split(",") if only else list(KINDS)

@@ -39,12 +39,7 @@ _JPEG = (
 
 @dataclass(frozen=True, slots=True)
 class SamplePart:
-    """The part of a campaign's drive that ships.
-
-    Attributes:
-        session: number of the drive.
-        first, last: its frames, the last one not included.
-    """
+    """The part of a campaign's drive that ships."""
 
     session: int
     first: int

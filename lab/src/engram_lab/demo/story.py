@@ -33,14 +33,7 @@ _SHOWN_AT = 0.35
 
 @dataclass(slots=True)
 class DemoReport:
-    """What the demo did.
-
-    Attributes:
-        out: folder with logs, map and pictures.
-        mapped: one report per drive that made the map, with the conditions it was driven in.
-        conditions: of each drive, the localised one last.
-        localised: policy → most attempts a frame → summary of the last drive.
-    """
+    """What the demo did."""
 
     out: Path
     conditions: list[str] = field(default_factory=list)
@@ -61,15 +54,6 @@ def run_demo(out: Path, monitor: Monitor = QUIET, workers: int = 2) -> DemoRepor
     """Renders the drives, maps all but the last, localises the last, and draws pictures.
 
     What an earlier run has rendered is not rendered again.
-
-    Args:
-        out: folder to write to, made where there is none.
-        monitor: hears of every frame.
-        workers: processes that render.
-
-    Raises:
-        InputError: the folder cannot be made.
-        MissingExtraError: Matplotlib is not installed.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)

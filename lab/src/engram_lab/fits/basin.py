@@ -24,7 +24,7 @@ from engram_lab.bench.data import scale_and_crop
 from engram_lab.charts import Line as Curve
 from engram_lab.charts import Panel, draw_curves
 from engram_lab.programs import command_line
-from engram_lab.studies.pages import write_csv
+from engram_lab.studies.plan import write_csv
 from engram_lab.town.campaigns import campaign_named
 from engram_lab.town.session import SimulatedDrive
 

@@ -140,7 +140,6 @@ class Rows:
     """Matches of robots, and of places that look like where they are not.
 
     Attributes:
-        met: matches that robots met.
         alike: look-alikes, as lost robots would meet them, robots that were told to be there, and
             robots that were carried from there.
     """
@@ -382,13 +381,7 @@ def passing(model: ConfidenceModel, rows: Rows) -> Iterator[Figure]:
 
 
 def estate_rows(towns: Sequence[int], settings: Settings, monitor: Monitor) -> list[Row]:
-    """Matches of robots that are switched on next to a mapped ring of equal fronts: all are wrong.
-
-    Args:
-        towns: seeds of the estates, which are rendered if they are not there.
-        settings: the configuration.
-        monitor: hears of what is collected.
-    """
+    """Matches of robots switched on next to a mapped ring of equal fronts: all are wrong."""
     rows: list[Row] = []
     for seed in towns:
         town = estate(seed)

@@ -33,7 +33,7 @@ from engram.maps.map_files import check_file
 from engram.maps.rows import checksum
 from engram_lab.mutations import case
 from engram_lab.mutations.case import Case, Samples, Subject
-from engram_lab.mutations.rowwise import changed_value
+from engram_lab.mutations.files import changed_value
 
 
 def pages(samples: Samples, folder: Path, chance: random.Random) -> Case:
@@ -112,11 +112,7 @@ _TRICKS = ("..%2f..%2fetc%2fpasswd", "..", "fleet%00", "%2e%2e", "a" * 3_000, "~
 
 
 class Site:
-    """A centre, a robot that handed in, and one that is hostile.
-
-    Attributes:
-        answers: how often each status was answered.
-    """
+    """A centre, a robot that handed in, and one that is hostile."""
 
     def __init__(self, folder: Path, samples: Samples) -> None:
         limits = CentreSettings(token_s=86_400, admission_bytes=2**30, admission_s=30)

@@ -34,11 +34,6 @@ class BuiltSession:
     """What adding one training session came to.
 
     Attributes:
-        name: of the drive.
-        revision: of the map with it.
-        nodes: of the map with it.
-        share_localised: of its frames.
-        seconds: it took.
         frames, attempts, proposed, lookups: how many frames, match attempts, those of them at nodes
             proposed to a lost robot, and frames for which the relocaliser was asked: what it took,
             on whatever machine.
@@ -57,13 +52,7 @@ class BuiltSession:
 
 @dataclass(slots=True)
 class BuiltMap:
-    """A fold's map.
-
-    Attributes:
-        path: the file.
-        sessions: as they were added, in the order of time.
-        in_force: what its newest drive was mapped by.
-    """
+    """A fold's map."""
 
     path: Path
     sessions: list[BuiltSession] = field(default_factory=list)
@@ -90,17 +79,7 @@ def build_map(
     was built with interruptions is the same as one that was not.
 
     Args:
-        path: NAME.engram; NAME.json beside it tells how far it is.
-        drives: the training sessions, in the order of time.
-        settings: the resolved configuration.
-        options: the budget of the build.
         base: the map to which the drives are added; None for an empty one.
-        known: the drives that the base was built from.
-        look_at: is shown how each drive went, before it counts as done.
-
-    Raises:
-        MapError: the map cannot be written.
-        SequenceError: a drive cannot be read.
     """
     built = read_built_map(path)
     for drive in drives[len(built.sessions) :]:
@@ -163,11 +142,7 @@ def read_built_map(path: Path) -> BuiltMap:
 
 
 def read_record(path: Path) -> BuiltMap:
-    """The record stored with a map, read without the map.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """The record stored with a map, read without the map."""
     record = path.with_suffix(".json")
     if not record.exists():
         return BuiltMap(path)
@@ -239,7 +214,6 @@ class EdgeError:
     """How wrong an edge is.
 
     Attributes:
-        kind: origin of the edge.
         error_m: how far off it is, metres.
         joins_places: whether it joins two places, which ruins a map. Where odometry had
             lost track, edges are far off and say so.
@@ -256,7 +230,6 @@ def edge_errors(
     """The errors of the edges between nodes whose true poses are known.
 
     Args:
-        edges: of a map.
         world_from_node: true pose of a node; None where it is not known.
     """
     for edge in edges:

@@ -56,10 +56,7 @@ class Configuration:
     """One way to localise the held-out sessions; what it leaves out, the settings give.
 
     Attributes:
-        policy: name of a ranking policy.
-        lanes, rounds: Np and Nr.
         T: iterations remembered; None for those of the settings.
-        radius: of the search for candidates.
         paths: which entries count in path memory; None for those of the settings.
         sessions: in the map after so many training sessions; None for all of them.
     """
@@ -137,9 +134,6 @@ def sweep(
     """All that is run in the whole map: policy × Np, T, Nr = 2, and the variants of `path-near`.
 
     Args:
-        policies: names of ranking policies.
-        lanes: Np; `UNLIMITED` for as many attempts as there are candidates.
-        rounds: Nr; rounds beyond the first are run for `TWO_ROUNDS` only.
         config: the settings, from which the variants differ; None for the defaults.
     """
     config = config or LocaliserConfig()

@@ -41,11 +41,6 @@ class EvaluatedDrive:
     """One drive, recorded as a frame log.
 
     Attributes:
-        path: NAME.framelog.
-        session: its session.
-        camera: its camera.
-        descriptor: kind of its descriptors.
-        frontend, odometry: hashes of the front-end and the odometry that made it.
         truth_hash: of its true poses, which stand beside it; None where there are none. Those of
             all drives of an evaluation are in one world frame.
         world: version of the simulated world that it was rendered in; None for other drives.
@@ -110,12 +105,7 @@ def _truth(path: Path, content: str) -> Truth | None:
 
 @dataclass(frozen=True, slots=True)
 class DriveSet:
-    """What is evaluated together.
-
-    Attributes:
-        name: of the campaign; for figures, tables and folders.
-        drives: in the order of time.
-    """
+    """What is evaluated together."""
 
     name: str
     drives: tuple[EvaluatedDrive, ...]
@@ -150,18 +140,7 @@ class DriveSet:
 def open_campaign(
     text: str, campaigns: Path, size: Size = Size.STANDARD, settings: Settings | None = None
 ) -> DriveSet:
-    """A rendered campaign, by ``NAME`` or ``NAME@SEED`` of its town.
-
-    Args:
-        text: such as ``begbroke`` or ``village@2``.
-        campaigns: folder below which campaigns were rendered.
-        size: of the campaign.
-        settings: of front-end and odometry; sessions of the same front-end get this odometry.
-
-    Raises:
-        ConfigError: there is no such campaign.
-        SequenceError: some of its sessions are not rendered.
-    """
+    """A rendered campaign, by ``NAME`` or ``NAME@SEED`` of its town."""
     name, _, seed = text.partition("@")
     try:
         number = int(seed or 1)
@@ -191,13 +170,7 @@ def campaign_logs(campaign: Campaign, campaigns: Path) -> list[Path]:
 
 
 def drives_of(paths: Sequence[Path]) -> tuple[EvaluatedDrive, ...]:
-    """Frame logs as drives, in the order of time.
-
-    Raises:
-        SequenceError: one is not a frame log, was not recorded to its end, is there twice, or its
-            truth cannot be read.
-        IncompatibleError: they have different kinds of descriptors.
-    """
+    """Frame logs as drives, in the order of time."""
     drives = sorted((_drive(path) for path in paths), key=lambda d: (d.session.start_ns, d.name))
     by_id: dict[object, EvaluatedDrive] = {}
     for drive in drives:
@@ -250,8 +223,6 @@ class Fold:
 
     Attributes:
         number: 0, 1, ….
-        training: sessions that the map is built from, in the order of time.
-        held_out: sessions that are localised in it.
     """
 
     number: int
@@ -260,11 +231,7 @@ class Fold:
 
 
 def split(sessions: int, folds: int = 5, seed: int = 0) -> tuple[Fold, ...]:
-    """Every session is held out once; seeded shuffle, sizes within one. Source: method §8.
-
-    Raises:
-        ConfigError: fewer than two folds, or fewer sessions than folds.
-    """
+    """Every session is held out once; seeded shuffle, sizes within one. Source: method §8."""
     if not 2 <= folds <= sessions:
         raise ConfigError(
             f"cannot split {sessions} sessions into {folds} folds; there must be at least 2 folds "
@@ -279,17 +246,13 @@ def split(sessions: int, folds: int = 5, seed: int = 0) -> tuple[Fold, ...]:
     )
 
 
-def chosen(folds: tuple[Fold, ...], only: tuple[int, ...]) -> tuple[Fold, ...]:
+def chosen_folds(folds: tuple[Fold, ...], only: tuple[int, ...]) -> tuple[Fold, ...]:
     """Some folds by their numbers; all where none is named."""
     return tuple(folds[number] for number in sorted(set(only))) if only else folds
 
 
 def check_only(only: tuple[int, ...], folds: int) -> None:
-    """Whether some requested folds exist.
-
-    Raises:
-        ConfigError: one does not.
-    """
+    """Whether some requested folds exist."""
     strange = [one for one in only if not 0 <= one < folds]
     if strange:
         raise ConfigError(
@@ -304,12 +267,7 @@ _VIEW_GATE_RAD = float(np.deg2rad(60.0))  # as for candidates, method §3.1
 
 
 class TrueNodes:
-    """True poses of a map's nodes.
-
-    Args:
-        opened: the map.
-        truths: of the sessions that it was built from; may lack some.
-    """
+    """True poses of a map's nodes."""
 
     def __init__(self, opened: Map, truths: Mapping[SessionId, Truth | None]) -> None:
         self._poses: dict[NodeId, SE3] = {}
@@ -395,12 +353,7 @@ def start_by_matching(
 
 
 class KeptMaps:
-    """The map files requested last, as they were when they were opened; one worker's.
-
-    Args:
-        files: how many are kept, each in all the revisions that were asked for.
-        cache_bytes: how much memory the landmarks of each map may take.
-    """
+    """The map files requested last, as they were when they were opened; one worker's."""
 
     def __init__(self, files: int, cache_bytes: int = DEFAULT_CACHE_BYTES) -> None:
         self._most = files
@@ -408,11 +361,7 @@ class KeptMaps:
         self._files: OrderedDict[tuple[Path, int], dict[int | None, Map]] = OrderedDict()
 
     def open(self, path: Path, at: int | None = None) -> Map:
-        """A map, of a revision if one is given. It is closed here, once others are requested.
-
-        Raises:
-            MapError: it cannot be read.
-        """
+        """A map, of a revision if one is given. It is closed here, once others are requested."""
         # A map that was made again is another file of the same name.
         file = path, path.stat().st_ino
         maps = self._files.setdefault(file, {})

@@ -61,9 +61,6 @@ def of_localiser(
     """What a held-out drive is localised by.
 
     Args:
-        localiser: of the drive.
-        gaps: guesses the motion that its odometry did not measure.
-        drive: the drive; front-end and odometry are in its log.
         matcher: what makes its matches; None for the localiser itself.
     """
     found = {**_of(localiser.in_force), **by_key(gaps.config, "gaps")}
@@ -129,13 +126,7 @@ def columns(known: Mapping[str, Any]) -> Values:
 
 
 def rows(known: Mapping[str, Any], settings: AllSettings, about: Mapping[str, Any]) -> list[Values]:
-    """A row per setting and version in force, next to what the settings say.
-
-    Args:
-        known: what is in force.
-        settings: what the study was given.
-        about: the first columns.
-    """
+    """A row per setting and version in force, next to what the settings say."""
     given, other = by_key(settings), differing(known, settings)
     return [
         {
@@ -150,12 +141,7 @@ def rows(known: Mapping[str, Any], settings: AllSettings, about: Mapping[str, An
 
 
 def exceptions(known: Mapping[str, Any], settings: AllSettings) -> Iterator[str]:
-    """What of the settings is not in force, for people.
-
-    Args:
-        known: what is in force.
-        settings: what the study was given.
-    """
+    """What of the settings is not in force, for people."""
     other = differing(known, settings)
     varied = [f"`{key} = {other[key][1]}`" for key in VARIED if key in other]
     if varied:
@@ -183,11 +169,7 @@ def changed_tables(settings: AllSettings, used: Collection[str]) -> list[str]:
 
 
 def check_logs(settings: Settings, drives: DriveSet) -> None:
-    """Refuses settings of front-end and odometry, unless the drives' logs were made by them.
-
-    Raises:
-        ConfigError: a log was made otherwise; names the setting.
-    """
+    """Refuses settings of front-end and odometry, unless the drives' logs were made by them."""
     kind, asked = drives.drives[0].descriptor, settings.frontend.descriptor
     if asked not in {Settings().frontend.descriptor, kind}:
         raise ConfigError(
@@ -212,11 +194,7 @@ def check_logs(settings: Settings, drives: DriveSet) -> None:
 
 
 def check_lost(settings: Settings, relocaliser: str | None) -> None:
-    """Refuses bounds of lost robots' attempts where matches are made once for all of them.
-
-    Raises:
-        ConfigError: such a bound is not the usual one; names it.
-    """
+    """Refuses bounds of lost robots' attempts where matches are made once for all of them."""
     changed = differing(by_key(settings.localiser, "localiser"), Settings())
     for key in _BOUNDS_OF_THE_LOST:
         if relocaliser is not None and key in changed:
@@ -228,16 +206,7 @@ def check_lost(settings: Settings, relocaliser: str | None) -> None:
 
 
 def check_used(settings: AllSettings, used: Collection[str], by: str) -> None:
-    """Refuses settings of tables that nothing reads.
-
-    Args:
-        settings: what was given.
-        used: the tables that are read.
-        by: what reads them, for people.
-
-    Raises:
-        ConfigError: another table departs from the defaults; names the setting.
-    """
+    """Refuses settings of tables that nothing reads."""
     for table in changed_tables(settings, used):
         changed = differing(by_key(getattr(settings, table), table), AllSettings())
         key, (value, _) = next(iter(changed.items()))

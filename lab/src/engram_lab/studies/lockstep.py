@@ -88,7 +88,6 @@ class Runs:
     """How one drive was localised by C configurations, F frames each.
 
     Attributes:
-        configurations: the C configurations.
         step_m: (F,) float64, distance of the step that ends in the frame: by odometry, guessed
             where that failed.
         matched: (C, F) bool, whether the frame was localised.
@@ -100,7 +99,6 @@ class Runs:
         offset_m, turn_rad: (C, F) float32, error of the pose of a success; NaN without one, or
             without truth.
         step_ms: (C,) float64, mean time of a frame; with a memo without the making of new matches.
-        in_force: of each configuration, what its localiser ran by.
     """
 
     configurations: tuple[Configuration, ...]
@@ -145,12 +143,8 @@ class Situation:
     """One held-out drive and the map that it is localised in.
 
     Attributes:
-        opened: the map, which stays as it is.
-        drive: the drive.
-        frames: its frames.
         start: number of the first frame that is localised, and the position there; None where
             no start is known.
-        nodes: true poses of the map's nodes.
         truth: true poses of the drive; None where they are not known.
     """
 
@@ -181,9 +175,6 @@ def run_in_step(
     """Localises the drive with every configuration, frame by frame.
 
     Args:
-        situation: drive and map.
-        configurations: what to run.
-        settings: the resolved configuration.
         matcher: makes the matches, unguided; None for the localiser's own, guided ones.
         relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near.
         cost_so_far: seconds spent in making matches; left out of `step_ms`.
@@ -419,12 +410,6 @@ class MatchMemo:
     """A `Matcher` that asks another one only for what it does not contain.
 
     What it gives back has no rows of landmarks: nobody behind the matcher looks at them.
-
-    Args:
-        matcher: makes the matches that are not known.
-        path: where they are kept, NAME.npz; an unreadable file or one of another matcher counts
-            as empty, since all it holds can be made again.
-        matcher_hash: of the matcher's settings and version.
     """
 
     def __init__(self, matcher: Matcher, path: Path, matcher_hash: str) -> None:

@@ -64,12 +64,6 @@ def localise_held_out(
     matches any node.
 
     Args:
-        opened: the map; it stays as it is.
-        drive: the drive, which is not in it.
-        frames: of the drive.
-        training: at least the drives that the map was built from.
-        configurations: what to run.
-        settings: the resolved configuration.
         matcher: makes the matches, unguided; None for the localiser's own, guided ones.
         relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near.
         threads: most threads that a robot's lanes share; None for one each.
@@ -102,12 +96,8 @@ class RankingOptions(StudyOptions):
     """What an evaluation of ranking policies runs.
 
     Attributes:
-        policies: names of ranking policies.
-        lanes, rounds: Np and Nr.
-        map_sizes: whether earlier revisions are run too ([L15] Fig. 9).
         live_folds: folds whose sessions are also run guided and without memo, at Np = 2: that
             confirms the order of policies and gives milliseconds per frame.
-        build: how the maps are built.
     """
 
     policies: tuple[str, ...] = STUDIED
@@ -165,16 +155,6 @@ def make_plan(drives: DriveSet, settings: Settings, options: RankingOptions, wor
     """A plan; its folder below `work` depends on all that its maps and results depend on.
 
     More policies, lanes or relocalisers may be run later, and find there what was done.
-
-    Args:
-        drives: what is evaluated.
-        settings: of the robots, or those of all verbs.
-        options: what is run.
-        work: folder of all studies.
-
-    Raises:
-        ConfigError: a setting cannot be obeyed here: the drives were made by another, or matches
-            are made once for all.
     """
     check_logs(settings, drives)
     check_lost(settings, options.relocaliser)
@@ -193,16 +173,6 @@ def run(plan: Plan, workers: int = 1, monitor: Monitor = QUIET) -> None:
 
     Fold by fold: sessions are run as soon as their map is built. Results do not depend on the
     number of workers. Killed or interrupted, the same call continues.
-
-    Args:
-        plan: what to run.
-        workers: processes.
-        monitor: hears of each task that is done.
-
-    Raises:
-        MapError: a map cannot be written, or no space is left.
-        MapLockedError: another run works in the same folder.
-        InputError: a drive cannot be read, or results cannot be written.
     """
     plan.run(_tasks(plan), workers, monitor, _earlier_maps.close)
 

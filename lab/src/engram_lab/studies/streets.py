@@ -71,11 +71,9 @@ class Try:
     """One robot.
 
     Attributes:
-        kind: what happens to it.
         first: its first frame, or that after a gap or where it was carried to; undisturbed robots
             and those that start lost drive to the end of the drive.
         sigma_m: of a wrong place that it is given; 0 else.
-        seed: of where it is placed, or was carried from.
     """
 
     kind: Kind
@@ -101,12 +99,7 @@ class Street:
     """A map and a drive in the same town, with truth.
 
     Args:
-        path: where the map is kept; built if it is not there.
-        mapped: the drives that it is built from.
-        live: the drive to be localised.
         settings: of robots; maps are built with the default `localiser` and `gaps`.
-        lost_rounds: budget of a lost robot.
-        same_town: whether the drive is one of the map's town; else every pose is false.
     """
 
     def __init__(
@@ -205,8 +198,6 @@ class Street:
         """Drives the robot, frame by frame.
 
         Args:
-            one: what happens to it.
-            relocalises: whether it looks for itself elsewhere.
             outside: what its wheels and gyroscope measure before each frame of the drive, of a
                 robot that is shown all frames; None without them.
         """
@@ -291,11 +282,7 @@ _CONFIRMED = 20
 
 
 class WrongPlaces:
-    """All attempts of a drive at the nodes of a map that are elsewhere.
-
-    Attributes:
-        attempts: how many were made so far.
-    """
+    """All attempts of a drive at the nodes of a map that are elsewhere."""
 
     def __init__(self, street: Street, every: int = 1) -> None:
         self._street, self._every = street, every
@@ -321,7 +308,6 @@ class WrongPlaces:
         """As by robots whose position is where such a match is, with each deviation.
 
         Args:
-            frame, there: the match.
             usual_inliers: of the fixes of a robot that was carried; 0 for one that was placed.
         """
         pose, index = there.match.reference_from_live, there.candidate.index
@@ -505,15 +491,7 @@ def streets(
     monitor: Monitor = QUIET,
     which: Sequence[tuple[tuple[int, ...], int]] = STREETS,
 ) -> Iterator[tuple[str, Street]]:
-    """The streets of some towns by name; renders and maps what is not there yet.
-
-    Args:
-        towns: seeds.
-        settings: of robots.
-        lost_rounds: budget of a lost robot.
-        monitor: receives what is rendered.
-        which: numbers of the drives that are mapped, and of the one that is localised.
-    """
+    """The streets of some towns by name; renders and maps what is not there yet."""
     for seed in towns:
         town = trial_town(seed)
         drives = drives_in(town, settings, monitor=monitor)

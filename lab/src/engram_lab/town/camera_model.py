@@ -43,8 +43,6 @@ class Lens:
 
     Attributes:
         dirt: 0…1, specks and smears that stay.
-        covered_from_m, covered_to_m: stretch on which something lies over both lenses.
-        glass: what rain meets before both lenses, in world 6.
     """
 
     dirt: float = 0.0
@@ -82,14 +80,7 @@ class Met:
 
 
 class CameraModel:
-    """Turns luminance into grey levels; keeps the exposure from frame to frame.
-
-    Args:
-        robot: whose camera.
-        seed: of noise, drops and dirt.
-        lens: what is wrong with it.
-        world: whose rain and exposure.
-    """
+    """Turns luminance into grey levels; keeps the exposure from frame to frame."""
 
     def __init__(self, robot: Robot, seed: int, lens: Lens, world: World = World.FIVE) -> None:
         self._robot = robot
@@ -124,9 +115,6 @@ class CameraModel:
         Args:
             luminance: (2, height, width), linear.
             inverse_depths: (2, height, width), 1/m.
-            pose: motion while the shutter is open.
-            moment: light and weather there.
-            frame: number of the frame, seeds its noise.
         """
         if self._lens.covered_from_m <= pose.driven_m < self._lens.covered_to_m:
             luminance = _covered(luminance)

@@ -16,18 +16,7 @@ from engram_lab.town.streets import Junction, Route, StreetPlan
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A robot's eyes.
-
-    Attributes:
-        name: key in `ROBOTS`.
-        camera: rectified stereo pair.
-        height_m: of the left camera above the road.
-        pitch_rad: downwards.
-        read_noise, shot_noise: of the sensor, see `engram_lab._town.develop`.
-        vignette: loss of light in the corners.
-        shake: factor on the unsteadiness of its ride.
-        on_handlebars: rolls into bends and yaws with the steering, as on a bicycle.
-    """
+    """A robot's eyes."""
 
     name: str
     camera: StereoCamera
@@ -106,11 +95,7 @@ EXACT = Residual()
 
 
 def robot_named(name: str) -> Robot:
-    """A robot of the fleet.
-
-    Raises:
-        ConfigError: no such robot.
-    """
+    """A robot of the fleet."""
     if name not in ROBOTS:
         raise ConfigError(f"unknown robot '{name}'; known are: {', '.join(ROBOTS)}")
     return ROBOTS[name]
@@ -128,7 +113,6 @@ class Line:
 
     Attributes:
         points: (N, 2) metres, about `_STEP_M` apart.
-        length_m: all the way round.
     """
 
     points: Array
@@ -216,10 +200,6 @@ class Pose:
     """Where the left camera is at one frame.
 
     Attributes:
-        world_from_cam: its pose; world axes x east, y north, z up.
-        driven_m: along the line since the start of the session.
-        elapsed_s: since the start.
-        speed_m_s: forwards.
         twist: (6,) motion in camera axes a second: translation m/s, rotation rad/s.
     """
 
@@ -232,14 +212,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class DrivingStyle:
-    """How one session strays from the line.
-
-    Attributes:
-        seed: of all below.
-        offset_m: constant lateral offset of the session, standard deviation.
-        sway_m: slow lateral sway, standard deviation.
-        speed_m_s: mean.
-    """
+    """How one session strays from the line."""
 
     seed: int
     offset_m: float = 0.3

@@ -40,13 +40,7 @@ class Materials:
     """Numbers of the textures that all of a town shares.
 
     Attributes:
-        stone, bark, metal, roof, grass, cloth, rubber, glass, light: one each.
-        paints: car paints from dark to bright.
         foliage: (season, variant) → texture; seasons are 0 summer, 1 autumn, 2 bare.
-        hedges: the same for hedges, which stay green.
-        railing: bars.
-        signs, sign_backs: traffic signs; their bare backs, in the same order.
-        plates: number plates.
     """
 
     stone: int
@@ -637,9 +631,6 @@ class Front:
     Attributes:
         corner: (3,) its lower left corner seen from the street, metres.
         along: (3,) unit vector to the right, level.
-        texture: number of the facade's texture.
-        stone: number of a generic texture for sills and the like.
-        tint: factor on the albedo.
     """
 
     corner: Vector

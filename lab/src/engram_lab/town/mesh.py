@@ -144,12 +144,6 @@ class MeshBuilder:
         Args:
             centre: (3,) metres.
             half_axes: (3, 3), rows: half its extent along its own east, north and up.
-            texture: number of the texture, laid on at `per_m` of its size a metre.
-            kind: what it belongs to.
-            per_m: texture lengths a metre.
-            flags: how it meets light.
-            tint: factor on the albedo.
-            faces: which of east, west, north, south, top, bottom.
         """
         c = np.asarray(centre, dtype=np.float64)
         a, b, up = np.asarray(half_axes, dtype=np.float64)
@@ -199,8 +193,6 @@ class FrameTruth:
     """Truth of one frame.
 
     Attributes:
-        world_from_cam: pose of the left camera; world axes x east, y north, z up.
-        camera: the camera.
         depth_m: (height, width) float32, along the optical axis, at each pixel's centre;
             infinite where it sees the sky.
         kinds: (height, width) int32, `Kind` of what is seen there, −1 for the sky.

@@ -46,13 +46,7 @@ class SimulatedDrive:
     town share one scene: not for use from several threads at once.
 
     Args:
-        campaign: what to drive through.
-        session: number of the drive.
-        threads: of the renderer, 1 to 256.
         robot: drives in place of the plan's.
-
-    Raises:
-        ConfigError: no such session, or another number of threads.
     """
 
     def __init__(
@@ -181,16 +175,7 @@ def _town_of(streets: StreetPlan, route: Route, style: Style) -> Town:
 
 
 class SimulatedSequence:
-    """Renders as it is read: a `StereoSequence`.
-
-    Args:
-        campaign: the campaign.
-        session: which of its drives.
-        threads: of the renderer.
-
-    Raises:
-        ConfigError: the campaign has no such session.
-    """
+    """Renders as it is read: a `StereoSequence`."""
 
     def __init__(self, campaign: Campaign, session: int, threads: int = 1) -> None:
         self._drive = SimulatedDrive(campaign, session, threads)

@@ -57,14 +57,6 @@ def bring_up_to_date(path: Path, settings: Settings) -> Upkeep:
     front-end that compared the sides as they are holds what is measured now: both cameras of a
     rendered rig have one exposure. The log is replaced in one step; frames, hashes of images and
     the drive's identity stay.
-
-    Args:
-        path: NAME.framelog, recorded to its end.
-        settings: of front-end and odometry.
-
-    Raises:
-        IncompatibleError: it was made by another front-end: its landmarks are others.
-        MapError: it cannot be read or written; it stays as it was.
     """
     log = FrameLog(path)
     try:
@@ -121,14 +113,7 @@ def _rewrite(log: FrameLog, draft: Path, header: FrameLogHeader, settings: Setti
 
 @dataclass(slots=True)
 class SimulateReport:
-    """What rendering a campaign came to.
-
-    Attributes:
-        folder: where the sessions are.
-        rendered, already_there: sessions of this run, and of earlier ones.
-        frames: stereo pairs rendered by this run.
-        files: one frame log, or one KITTI sequence folder, a session, in the order of time.
-    """
+    """What rendering a campaign came to."""
 
     folder: str
     rendered: int = 0
@@ -189,21 +174,10 @@ def simulate(
     whole sessions are kept, a session that was begun is rendered again.
 
     Args:
-        campaign: what to render.
-        out: folder; the campaign gets its own below it (`campaign_folder`).
-        images: KITTI layout instead of frame logs.
         sessions: numbers of the sessions wanted, each once however often it is named; None for
             all.
         workers: processes; each renders one session at a time and holds about 0.7 GB.
         settings: of front-end and odometry; None for the defaults.
-        monitor: hears of every pair that is rendered or was there already, with its session's name.
-
-    Raises:
-        ConfigError: no such session, or fewer than one worker.
-        IncompatibleError: a session that is there was made by another front-end.
-        StorageFullError: no space is left; what was finished is kept.
-        SequenceError: a file cannot be written.
-        WorkerError: a worker died, perhaps for want of memory; finished sessions are kept.
     """
     if workers < 1:
         raise ConfigError(f"workers is {workers}, must be >= 1")

@@ -34,11 +34,7 @@ class Unique(StrEnum):
 
     @classmethod
     def named(cls, text: str) -> frozenset[Unique]:
-        """Several, joined by commas.
-
-        Raises:
-            ConfigError: one of them is unknown.
-        """
+        """Several, joined by commas."""
         names = [name for name in text.split(",") if name]
         for name in names:
             if name not in list(cls):
@@ -55,9 +51,6 @@ class Fronts:
         equal: share of the houses that are copies; the others are each unique.
         unique: what else is unique: tarmac and pavement, with its width; trees, signs and benches;
             parked cars. The rest is the same around each block.
-
-    Raises:
-        ConfigError: the period is outside 10 to 75 m, or the share outside 0 to 1.
     """
 
     period_m: float = 37.5
@@ -86,8 +79,6 @@ class StreetPlan:
     """Where streets run.
 
     Attributes:
-        seed: of the town.
-        spacing_m: mean distance between junctions.
         fronts: how the fronts repeat, along straight streets of one width; None where each is
             unique.
     """
@@ -167,12 +158,7 @@ def _inset(outline: Points, offsets_m: Points) -> Points:
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """A closed drive.
-
-    Attributes:
-        junctions: that it passes, in order; the first follows the last.
-        beside: another drive, along whose streets the town is made as finely.
-    """
+    """A closed drive."""
 
     junctions: tuple[Junction, ...]
     beside: Route | None = None
@@ -191,11 +177,7 @@ class Route:
 
 
 def loop_of_length(length_m: float, seed: int) -> tuple[StreetPlan, Route]:
-    """A plan and a loop in it of about a length.
-
-    Raises:
-        ConfigError: the length is outside 100 m to 8 km.
-    """
+    """A plan and a loop in it of about a length."""
     if not 100 <= length_m <= 8000:
         raise ConfigError(f"route length is {length_m} m, must be 100 to 8000 m")
     # Streets of 37 to 75 m, and an even number of them, since a loop on a grid has one.

@@ -17,13 +17,7 @@ SIDE = 1024  # texels of a field; far larger than what is cut from it, so that c
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseFields:
-    """Tiling fields of mean 0 and variance 1, each (SIDE, SIDE) float32.
-
-    Attributes:
-        rough: all scales, like weathered plaster.
-        soft: only scales beyond about 12 texels, like stains.
-        grain: white noise, band-limited to about 4 texels so that it does not beat with pixels.
-    """
+    """Tiling fields of mean 0 and variance 1, each (SIDE, SIDE) float32."""
 
     rough: Field
     soft: Field
@@ -89,10 +83,6 @@ class Style:
 
     These two set how hard a change of light is, and were chosen by the calibration
     (`lab/reports/town.md`), before any evaluation.
-
-    Attributes:
-        paint_contrast: exponent on albedo about its mean; 1 is as painted, less is flatter.
-        relief: factor on the slopes that bend normals.
     """
 
     paint_contrast: float = 0.21
@@ -141,8 +131,6 @@ class Facade:
     """What makes one front distinct.
 
     Attributes:
-        width_m, height_m: its size.
-        openings: windows, doors, shop fronts, in rows (`floors_m` bounds them).
         texels: (h, w, 4) uint8, of the whole front, `FACADE_PER_M` texels a metre.
     """
 

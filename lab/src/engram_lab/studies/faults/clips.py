@@ -48,15 +48,7 @@ _LIVE = 5
 
 @dataclass(frozen=True, slots=True)
 class ClipPlan:
-    """What a clip shows.
-
-    Attributes:
-        rig: key in `RIGS`.
-        town: seed of the town.
-        session: number of the village's drive whose day, hour and weather it has.
-        start, count: the frames of the drive.
-        reverse: driven the other way round, from where those frames end to where they begin.
-    """
+    """What a clip shows."""
 
     rig: str
     town: int
@@ -95,15 +87,7 @@ class ClipPlan:
 
 
 class Plan(Protocol):
-    """What a clip shows, rendered or real.
-
-    Attributes:
-        name: of the clip.
-        rig: name of the cameras.
-        town: seed of the town, or name of the place.
-        mapped: whether the map of the town is made of it.
-        reverse: driven against the direction of that map.
-    """
+    """What a clip shows, rendered or real."""
 
     @property
     def name(self) -> str: ...  # noqa: D102
@@ -122,13 +106,7 @@ class Plan(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clip:
-    """A clip with its truth.
-
-    Attributes:
-        plan: what it shows.
-        pairs: its frames.
-        world_from_cam: the truth, one pose a frame.
-    """
+    """A clip with its truth."""
 
     plan: Plan
     pairs: list[StereoPair]
@@ -142,14 +120,6 @@ class ClipDrive:
     """Frames of a clip as a `StereoSequence`.
 
     As a reader under ``skip_bad`` it leaves out frames that are not later than the one before.
-
-    Args:
-        plan: of the clip.
-        pairs: the frames, in the order in which a robot meets them; at least one.
-
-    Attributes:
-        info: the name of the clip and of its rig.
-        skipped: frames that are left out.
     """
 
     def __init__(self, plan: Plan, pairs: Sequence[StereoPair]) -> None:

@@ -1,11 +1,11 @@
-"""Injected faults: each a small class with a strength, applied to the frames of a drive."""
+"""Injected faults: each a function of a strength, applied to the frames of a drive."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -18,250 +18,133 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shown:
-    """One frame that a robot is shown.
-
-    Attributes:
-        frame: number of the frame of the drive where the robot is at this moment.
-        pair: what it sees, under the stamp that it is told.
-    """
+    """One frame that a robot is shown."""
 
     frame: int
     pair: StereoPair
 
 
-class Fault(Protocol):
+Pairs: TypeAlias = Sequence[StereoPair]
+Random: TypeAlias = np.random.Generator
+# Frames of a drive, strength, number of the first frame concerned, what is random → what is shown.
+Apply: TypeAlias = Callable[[Pairs, float, int, Random], list[Shown]]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
     """Something that goes wrong from a frame of a drive on.
 
     Attributes:
-        name: key in `FAULTS`.
-        unit: of the strength.
-        weakest, strongest: between which strengths are drawn, log-uniformly.
-    """
-
-    @property
-    def name(self) -> str: ...  # noqa: D102
-    @property
-    def unit(self) -> str: ...  # noqa: D102
-    @property
-    def weakest(self) -> float: ...  # noqa: D102
-    @property
-    def strongest(self) -> float: ...  # noqa: D102
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """The drive with the fault.
-
-        Args:
-            pairs: its frames.
-            strength: in `unit`.
-            start: number of the first frame that it concerns.
-            rng: of what is random in it.
-        """
-        ...
-
-
-def undisturbed(pairs: Sequence[StereoPair]) -> list[Shown]:
-    """The drive as it is."""
-    return [Shown(k, pair) for k, pair in enumerate(pairs)]
-
-
-@dataclass(frozen=True, slots=True)
-class Stall:
-    """The camera shows nothing for a while."""
-
-    name: str = "stall"
-    unit: str = "s"
-    weakest: float = 0.3
-    strongest: float = 4.0
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`."""
-        del rng
-        until_ns = pairs[start].stamp_ns + strength * 1e9
-        return [
-            one for one in undisturbed(pairs) if one.frame < start or one.pair.stamp_ns >= until_ns
-        ]
-
-
-@dataclass(frozen=True, slots=True)
-class Frozen:
-    """One or both cameras repeat an image under new stamps."""
-
-    sides: tuple[str, ...] = ("left", "right")
-    name: str = "frozen stream"
-    unit: str = "frames"
-    weakest: float = 1.0
-    strongest: float = 30.0
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`."""
-        del rng
-        old = {side: getattr(pairs[start - 1], side) for side in self.sides}
-        held = range(start, start + round(strength))
-        return [
-            Shown(k, replace(pair, **old) if k in held else pair) for k, pair in enumerate(pairs)
-        ]
-
-
-@dataclass(frozen=True, slots=True)
-class Some:
-    """Some frames, at random, are dropped, shown twice, or shown one too late.
-
-    Attributes:
-        how: "dropped", "duplicated" (a second time, under a stamp a little later), "reordered"
-            (after the next one, so that stamps run backwards).
-    """
-
-    how: str
-    name: str
-    unit: str = "of the frames"
-    weakest: float = 0.02
-    strongest: float = 0.5
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`."""
-        shown: list[Shown] = []
-        late: Shown | None = None
-        for one in undisturbed(pairs):
-            hit = one.frame >= start and late is None and rng.random() < strength
-            if hit and self.how == "dropped":
-                continue
-            if hit and self.how == "reordered":
-                late = one
-                continue
-            shown.append(one)
-            if hit:
-                again = replace(one.pair, stamp_ns=one.pair.stamp_ns + 40_000_000)
-                shown.append(Shown(one.frame, again))
-            if late is not None:
-                shown.append(late)
-                late = None
-        return shown
-
-
-@dataclass(frozen=True, slots=True)
-class ClockStep:
-    """The clock is set forwards or back."""
-
-    sign: int
-    name: str
-    unit: str = "s"
-    weakest: float = 1.0
-    strongest: float = 20_000.0
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`."""
-        del rng
-        step_ns = self.sign * round(strength * 1e9)
-        return [
-            Shown(k, replace(pair, stamp_ns=pair.stamp_ns + step_ns) if k >= start else pair)
-            for k, pair in enumerate(pairs)
-        ]
-
-
-@dataclass(frozen=True, slots=True)
-class LateSide:
-    """The right image is that of some frames before."""
-
-    name: str = "desynchronised pairs"
-    unit: str = "frames"
-    weakest: float = 1.0
-    strongest: float = 4.0
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`."""
-        del rng
-        late = round(strength)
-        return [
-            Shown(k, replace(pair, right=pairs[k - late].right) if k >= max(start, late) else pair)
-            for k, pair in enumerate(pairs)
-        ]
-
-
-@dataclass(frozen=True, slots=True)
-class Changed:
-    """Every pair from the start on, for so many frames, is changed by a function.
-
-    Attributes:
-        change: (pair, strength, share of the way through the fault 0…1, rng) → pair.
-        frames: how long it lasts; None to the end.
+        weakest, strongest: between which strengths are drawn, log-uniformly, in `unit`.
+        from_the_first: whether it is there from the first frame on, whatever the start.
     """
 
     name: str
     unit: str
     weakest: float
     strongest: float
-    change: Callable[[StereoPair, float, float, np.random.Generator], StereoPair]
-    frames: int | None = None
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`."""
-        stop = len(pairs) if self.frames is None else min(start + self.frames, len(pairs))
-        return [
-            Shown(
-                k,
-                self.change(pair, strength, (k - start + 1) / (stop - start), rng)
-                if start <= k < stop
-                else pair,
-            )
-            for k, pair in enumerate(pairs)
-        ]
+    apply: Apply
+    from_the_first: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Blackout:
+def undisturbed(pairs: Pairs) -> list[Shown]:
+    """The drive as it is."""
+    return [Shown(k, pair) for k, pair in enumerate(pairs)]
+
+
+def stalled(pairs: Pairs, seconds: float, start: int, _: Random) -> list[Shown]:
+    """The camera shows nothing for a while."""
+    until_ns = pairs[start].stamp_ns + seconds * 1e9
+    return [one for one in undisturbed(pairs) if one.frame < start or one.pair.stamp_ns >= until_ns]
+
+
+def frozen(
+    pairs: Pairs, frames: float, start: int, _: Random, sides: Sequence[str] = ("left", "right")
+) -> list[Shown]:
+    """One or both cameras repeat an image under new stamps."""
+    old = {side: getattr(pairs[start - 1], side) for side in sides}
+    held = range(start, start + round(frames))
+    return [Shown(k, replace(pair, **old) if k in held else pair) for k, pair in enumerate(pairs)]
+
+
+def irregular(pairs: Pairs, share: float, start: int, rng: Random, how: str) -> list[Shown]:
+    """Frames, drawn at random, that are dropped, shown twice, or shown one too late.
+
+    `how`: "dropped"; "duplicated", a second time, under a stamp a little later; "reordered", after
+    the next one, so that stamps run backwards.
+    """
+    shown: list[Shown] = []
+    late: Shown | None = None
+    for one in undisturbed(pairs):
+        hit = one.frame >= start and late is None and rng.random() < share
+        if hit and how == "dropped":
+            continue
+        if hit and how == "reordered":
+            late = one
+            continue
+        shown.append(one)
+        if hit:
+            again = replace(one.pair, stamp_ns=one.pair.stamp_ns + 40_000_000)
+            shown.append(Shown(one.frame, again))
+        if late is not None:
+            shown.append(late)
+            late = None
+    return shown
+
+
+def clock_set(pairs: Pairs, seconds: float, start: int, _: Random, sign: int = 1) -> list[Shown]:
+    """The clock is set forwards or back."""
+    step_ns = sign * round(seconds * 1e9)
+    return [
+        Shown(k, replace(pair, stamp_ns=pair.stamp_ns + step_ns) if k >= start else pair)
+        for k, pair in enumerate(pairs)
+    ]
+
+
+def late_side(pairs: Pairs, frames: float, start: int, _: Random) -> list[Shown]:
+    """The right image is that of some frames before."""
+    late = round(frames)
+    return [
+        Shown(k, replace(pair, right=pairs[k - late].right) if k >= max(start, late) else pair)
+        for k, pair in enumerate(pairs)
+    ]
+
+
+# A pair, strength, share of the fault's duration 0…1, what is random → the pair as it is shown.
+Change: TypeAlias = Callable[[StereoPair, float, float, Random], StereoPair]
+
+
+def changed(change: Change, frames: int | None = None) -> Apply:
+    """Every pair from the start on is changed, for so many frames; None to the end."""
+
+    def apply(pairs: Pairs, strength: float, start: int, rng: Random) -> list[Shown]:
+        stop = len(pairs) if frames is None else min(start + frames, len(pairs))
+        shown = undisturbed(pairs)
+        for k in range(start, stop):
+            pair = change(pairs[k], strength, (k - start + 1) / (stop - start), rng)
+            shown[k] = Shown(k, pair)
+        return shown
+
+    return apply
+
+
+def blackout(pairs: Pairs, frames: float, start: int, _: Random) -> list[Shown]:
     """Both images are black for some frames."""
-
-    name: str = "blackout"
-    unit: str = "frames"
-    weakest: float = 1.0
-    strongest: float = 40.0
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`."""
-        del rng
-        dark = range(start, start + round(strength))
-        return [
-            Shown(k, on_both(pair, np.zeros_like) if k in dark else pair)
-            for k, pair in enumerate(pairs)
-        ]
+    dark = range(start, start + round(frames))
+    return [
+        Shown(k, on_both(pair, np.zeros_like) if k in dark else pair)
+        for k, pair in enumerate(pairs)
+    ]
 
 
-@dataclass(frozen=True, slots=True)
-class Kidnapped:
-    """The robot is carried on along the route, unseen, and its stamps continue."""
-
-    name: str = "kidnapped"
-    unit: str = "frames"
-    weakest: float = 10.0
-    strongest: float = 60.0
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`."""
-        del rng
-        carried = round(strength)
-        behind = range(start + carried, len(pairs))
-        return [
-            *undisturbed(pairs[:start]),
-            *(Shown(k, replace(pairs[k], stamp_ns=pairs[k - carried].stamp_ns)) for k in behind),
-        ]
+def kidnapped(pairs: Pairs, frames: float, start: int, _: Random) -> list[Shown]:
+    """The robot is carried along the route, unseen, and its stamps continue."""
+    carried = round(frames)
+    after = range(start + carried, len(pairs))
+    return [
+        *undisturbed(pairs[:start]),
+        *(Shown(k, replace(pairs[k], stamp_ns=pairs[k - carried].stamp_ns)) for k in after),
+    ]
 
 
 def on_both(pair: StereoPair, change: Callable[[Image], Image]) -> StereoPair:
@@ -334,12 +217,11 @@ def with_drops(pair: StereoPair, drops: float, rng: np.random.Generator) -> Ster
     return on_both(pair, wet)
 
 
-def with_car(pair: StereoPair, share: float, rng: np.random.Generator) -> StereoPair:
+def with_car(pair: StereoPair, share: float, *_: object) -> StereoPair:
     """A textured car that keeps its distance ahead and fills a share of the image.
 
     Its texture is the same in every frame, so that odometry sees a robot at rest in front of it.
     """
-    del rng
     height, width = pair.left.shape
     side = min(np.sqrt(share), 0.95)
     rows, columns = int(height * side), int(width * side)
@@ -355,47 +237,40 @@ def with_car(pair: StereoPair, share: float, rng: np.random.Generator) -> Stereo
     return replace(pair, left=images[0], right=images[1])
 
 
-@dataclass(frozen=True, slots=True)
-class FixedPattern:
-    """Part of both images shows something that moves with the camera, from the first frame on.
+def fixed_pattern(
+    pairs: Pairs,
+    share: float,
+    _: int,
+    rng: Random,
+    side: str | None = None,
+    depth_m: float | None = None,
+    contrast: float | None = None,
+) -> list[Shown]:
+    """Part of both images shows something that moves with the camera; what is None is drawn.
 
-    Attributes:
+    Args:
+        share: of the image that it covers.
         side: of the image that it reaches in from: "bottom", "top", "left" or "right".
-        depth_m: how far it is from the camera.
         contrast: of its texture; 1 is from 20 to 200 grey levels.
     """
+    camera = pairs[0].camera
+    side = side or str(rng.choice(["bottom", "top", "left", "right"]))
+    depth_m = depth_m or float(np.exp(rng.uniform(np.log(1.0), np.log(6.0))))
+    contrast = contrast or float(rng.uniform(0.25, 1.0))
+    shift = max(1, round(camera.focal_baseline / depth_m))
+    noise = rng.integers(0, 256, (camera.height, camera.width + shift)).astype(np.uint8)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0).astype(np.float32)
+    spread = (smooth - smooth.min()) / max(float(np.ptp(smooth)), 1.0)
+    texture = np.asarray(90 + contrast * (180 * spread - 90), np.uint8)
+    where = reaching_in(camera.height, camera.width, side, share)
 
-    name: str = "fixed pattern"
-    unit: str = "of the image"
-    weakest: float = 0.1
-    strongest: float = 0.6
-    side: str | None = None
-    depth_m: float | None = None
-    contrast: float | None = None
+    def painted(image: Image, first: int) -> Image:
+        return np.where(where, texture[:, first : first + camera.width], image)
 
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`; what is None is drawn."""
-        del start
-        camera = pairs[0].camera
-        side = self.side or str(rng.choice(["bottom", "top", "left", "right"]))
-        depth_m = self.depth_m or float(np.exp(rng.uniform(np.log(1.0), np.log(6.0))))
-        contrast = self.contrast or float(rng.uniform(0.25, 1.0))
-        shift = max(1, round(camera.focal_baseline / depth_m))
-        noise = rng.integers(0, 256, (camera.height, camera.width + shift)).astype(np.uint8)
-        smooth = cv2.GaussianBlur(noise, (0, 0), 2.0).astype(np.float32)
-        spread = (smooth - smooth.min()) / max(float(np.ptp(smooth)), 1.0)
-        texture = np.asarray(90 + contrast * (180 * spread - 90), np.uint8)
-        where = reaching_in(camera.height, camera.width, side, strength)
-
-        def painted(image: Image, first: int) -> Image:
-            return np.where(where, texture[:, first : first + camera.width], image)
-
-        return [
-            Shown(k, replace(one, left=painted(one.left, 0), right=painted(one.right, shift)))
-            for k, one in enumerate(pairs)
-        ]
+    return [
+        Shown(k, replace(one, left=painted(one.left, 0), right=painted(one.right, shift)))
+        for k, one in enumerate(pairs)
+    ]
 
 
 def reaching_in(height: int, width: int, side: str, share: float) -> NDArray[np.bool_]:
@@ -410,32 +285,15 @@ def reaching_in(height: int, width: int, side: str, share: float) -> NDArray[np.
     return np.asarray(along < share, np.bool_)
 
 
-@dataclass(frozen=True, slots=True)
-class NeverMoved:
-    """Both cameras repeat their first image, under new stamps, from the first frame on.
-
-    Attributes:
-        burnt_in: whether the driver writes the time into each image.
-    """
-
-    name: str = "frozen from the start"
-    unit: str = "frames"
-    weakest: float = 30.0
-    strongest: float = 100.0
-    burnt_in: bool = False
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`."""
-        del start, rng
-        first, shown = pairs[0], []
-        for k, pair in enumerate(pairs[: round(strength)]):
-            old = replace(pair, left=first.left, right=first.right)
-            if self.burnt_in:
-                old = on_both(old, partial(written, text=f"{k:06d}"))
-            shown.append(Shown(k, old))
-        return shown + undisturbed(pairs)[round(strength) :]
+def never_moved(
+    pairs: Pairs, frames: float, _: int, __: Random, *, burnt_in: bool = False
+) -> list[Shown]:
+    """Both cameras repeat their first image; `burnt_in`: with the time written into each."""
+    first, shown = pairs[0], undisturbed(pairs)
+    for k, pair in enumerate(pairs[: round(frames)]):
+        old = replace(pair, left=first.left, right=first.right)
+        shown[k] = Shown(k, on_both(old, partial(written, text=f"{k:06d}")) if burnt_in else old)
+    return shown
 
 
 def written(image: Image, text: str) -> Image:
@@ -446,101 +304,77 @@ def written(image: Image, text: str) -> Image:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class HuntingExposure:
+_HUNTING_FRAMES, _SIDES_APART = 7.0, 1.2
+
+
+def hunting_exposure(pairs: Pairs, strength: float, start: int, rng: Random) -> list[Shown]:
     """Exposure that overshoots up and down for the rest of the drive, the sides not quite alike."""
-
-    name: str = "exposure that hunts"
-    unit: str = "times"
-    weakest: float = 1.3
-    strongest: float = 3.0
-    frames: float = 7.0
-    apart: float = 1.2
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`."""
-        phase = rng.uniform(0, 2 * np.pi)
-        shown = undisturbed(pairs)
-        for k in range(start, len(pairs)):
-            gain = strength ** np.sin(phase + 2 * np.pi * k / self.frames)
-            bright = brightened(pairs[k].left, gain), brightened(pairs[k].right, gain / self.apart)
-            shown[k] = Shown(k, replace(pairs[k], left=bright[0], right=bright[1]))
-        return shown
+    phase = rng.uniform(0, 2 * np.pi)
+    shown = undisturbed(pairs)
+    for k in range(start, len(pairs)):
+        gain = strength ** np.sin(phase + 2 * np.pi * k / _HUNTING_FRAMES)
+        bright = brightened(pairs[k].left, gain), brightened(pairs[k].right, gain / _SIDES_APART)
+        shown[k] = Shown(k, replace(pairs[k], left=bright[0], right=bright[1]))
+    return shown
 
 
-@dataclass(frozen=True, slots=True)
-class WrongStamps:
+def wrong_stamps(pairs: Pairs, seconds: float, start: int, rng: Random) -> list[Shown]:
     """A few frames carry a stamp that is far off; those after them are right again."""
-
-    name: str = "wrong stamps"
-    unit: str = "s"
-    weakest: float = 0.5
-    strongest: float = 3600.0
-
-    def apply(
-        self, pairs: Sequence[StereoPair], strength: float, start: int, rng: np.random.Generator
-    ) -> list[Shown]:
-        """See `Fault`."""
-        off_ns = int(rng.choice([-1, 1])) * round(strength * 1e9)
-        few = range(start, start + int(rng.integers(1, 4)))
-        zero = bool(rng.random() < 0.3)
-        return [
-            Shown(k, replace(pair, stamp_ns=0 if zero else pair.stamp_ns + off_ns))
-            if k in few
-            else Shown(k, pair)
-            for k, pair in enumerate(pairs)
-        ]
+    off_ns = int(rng.choice([-1, 1])) * round(seconds * 1e9)
+    few = range(start, start + int(rng.integers(1, 4)))
+    zero = bool(rng.random() < 0.3)
+    shown = undisturbed(pairs)
+    for k in few:
+        stamp_ns = 0 if zero else pairs[k].stamp_ns + off_ns
+        shown[k] = Shown(k, replace(pairs[k], stamp_ns=stamp_ns))
+    return shown
 
 
+def _decalibrated(pair: StereoPair, px: float, share: float, _: Random) -> StereoPair:
+    return replace(pair, right=lowered(pair.right, px * share, 0.003 * px * share))
+
+
+def _brighter(pair: StereoPair, gain: float, *_: object) -> StereoPair:
+    return on_both(pair, lambda image: brightened(image, gain))
+
+
+def _darker(pair: StereoPair, gain: float, *_: object) -> StereoPair:
+    return on_both(pair, lambda image: brightened(image, 1 / gain))
+
+
+def _one_side_darker(pair: StereoPair, gain: float, *_: object) -> StereoPair:
+    return replace(pair, right=brightened(pair.right, 1 / gain))
+
+
+_SHARE = "of the frames"
 FAULTS: dict[str, Fault] = {
     one.name: one
     for one in (
-        Stall(),
-        Frozen(),
-        Frozen(("right",), "right side frozen"),
-        Some("dropped", "dropped frames"),
-        Some("duplicated", "duplicated frames"),
-        Some("reordered", "reordered frames"),
-        ClockStep(1, "clock set forwards"),
-        ClockStep(-1, "clock set back"),
-        LateSide(),
-        Changed("swapped sides", "", 1, 1, lambda pair, *_: exchanged(pair)),
-        Changed(
-            "growing decalibration", "px", 0.5, 6.0,
-            lambda pair, px, share, _: replace(
-                pair, right=lowered(pair.right, px * share, 0.003 * px * share)
-            ),
+        Fault("stall", "s", 0.3, 4.0, stalled),
+        Fault("frozen stream", "frames", 1, 30, frozen),
+        Fault("right side frozen", "frames", 1, 30, partial(frozen, sides=("right",))),
+        Fault("dropped frames", _SHARE, 0.02, 0.5, partial(irregular, how="dropped")),
+        Fault("duplicated frames", _SHARE, 0.02, 0.5, partial(irregular, how="duplicated")),
+        Fault("reordered frames", _SHARE, 0.02, 0.5, partial(irregular, how="reordered")),
+        Fault("clock set forwards", "s", 1, 20_000, clock_set),
+        Fault("clock set back", "s", 1, 20_000, partial(clock_set, sign=-1)),
+        Fault("desynchronised pairs", "frames", 1, 4, late_side),
+        Fault("swapped sides", "", 1, 1, changed(lambda pair, *_: exchanged(pair))),
+        Fault("growing decalibration", "px", 0.5, 6.0, changed(_decalibrated)),
+        Fault("exposure jump", "times", 1.5, 8.0, changed(_brighter, 10)),
+        Fault("exposure drop", "times", 1.5, 20.0, changed(_darker, 10)),
+        Fault("blackout", "frames", 1, 40, blackout),
+        Fault("lens drops", "drops", 10, 300, changed(lambda p, n, _, rng: with_drops(p, n, rng))),
+        Fault("car ahead", "of the image", 0.1, 0.7, changed(with_car, 40)),
+        Fault("kidnapped", "frames", 10, 60, kidnapped),
+        Fault("fixed pattern", "of the image", 0.1, 0.6, fixed_pattern, True),
+        Fault("frozen from the start", "frames", 30, 100, never_moved, True),
+        Fault(
+            "frozen with a burnt-in time", "frames", 30, 100,
+            partial(never_moved, burnt_in=True), True,
         ),
-        Changed(
-            "exposure jump", "times", 1.5, 8.0,
-            lambda pair, gain, *_: on_both(pair, lambda image: brightened(image, gain)),
-            10,
-        ),
-        Changed(
-            "exposure drop", "times", 1.5, 20.0,
-            lambda pair, gain, *_: on_both(pair, lambda image: brightened(image, 1 / gain)),
-            10,
-        ),
-        Blackout(),
-        Changed("lens drops", "drops", 10, 300, lambda pair, n, _, rng: with_drops(pair, n, rng)),
-        Changed("car ahead", "of the image", 0.1, 0.7,
-                lambda pair, share, _, rng: with_car(pair, share, rng), 40),
-        Kidnapped(),
-        FixedPattern(),
-        NeverMoved(),
-        NeverMoved("frozen with a burnt-in time", burnt_in=True),
-        Changed(
-            "right side darker", "times", 1.2, 3.0,
-            lambda pair, gain, *_: replace(pair, right=brightened(pair.right, 1 / gain)),
-        ),
-        HuntingExposure(),
-        WrongStamps(),
+        Fault("right side darker", "times", 1.2, 3.0, changed(_one_side_darker)),
+        Fault("exposure that hunts", "times", 1.3, 3.0, hunting_exposure),
+        Fault("wrong stamps", "s", 0.5, 3600.0, wrong_stamps),
     )
 }  # fmt: skip
-
-# Faults that are there from the first frame on, whatever the start.
-FROM_THE_FIRST = frozenset(
-    {"fixed pattern", "frozen from the start", "frozen with a burnt-in time"}
-)

@@ -21,7 +21,7 @@ from engram.localiser.settings import METHOD_VERSION
 from engram.maps.map import Map, open_map
 from engram_lab.accuracy import Fix, is_false
 from engram_lab.studies.faults.clips import Clip, ClipPlan, Plan
-from engram_lab.studies.faults.injected import FAULTS, FROM_THE_FIRST, Shown, undisturbed
+from engram_lab.studies.faults.injected import FAULTS, Shown, undisturbed
 
 # A place is wrong that is so far off, m.
 _OFF_M = 15.0
@@ -31,13 +31,7 @@ _OTHER_TOWN = SE3(np.eye(3), np.array([1e4, 0.0, 0.0]))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """A town that is mapped by its first clip.
-
-    Attributes:
-        path: the map, NAME.engram.
-        opened: the same, opened.
-        world_from_node: true poses of its nodes.
-    """
+    """A town that is mapped by its first clip."""
 
     path: Path
     opened: Map
@@ -71,7 +65,6 @@ def mapped_by(clip: Clip, path: Path, world_from_town: SE3 | None = None) -> Pla
     """The place that a robot made that mapped a clip live.
 
     Args:
-        clip: what it saw.
         path: the map; must not exist yet.
         world_from_town: where the town of the clip lies; None for the origin.
     """
@@ -91,14 +84,7 @@ def mapped_by(clip: Clip, path: Path, world_from_town: SE3 | None = None) -> Pla
 
 
 def damaged(place: Place, path: Path, share: float, rng: np.random.Generator) -> Place:
-    """A copy of a place in which the landmarks of some nodes, at least one, cannot be read.
-
-    Args:
-        place: the sound one.
-        path: the copy; replaced if it is there.
-        share: of the nodes.
-        rng: chooses them, and what happened to them.
-    """
+    """A copy of a place in which the landmarks of some nodes, at least one, cannot be read."""
     shutil.copyfile(place.path, path)
     with closing(sqlite3.connect(path)) as connection, connection:
         rows = connection.execute("SELECT node, landmarks FROM frames ORDER BY node").fetchall()
@@ -122,12 +108,9 @@ class Places:
     """The maps of one town; the clips that are driven there.
 
     Args:
-        plans: all clips.
-        town: which town.
         folder: for the maps; must be empty.
 
     Attributes:
-        folder: the same.
         own: the town's map; None if the clip for it is missing.
         other: that of another town, if possible by the same kind of camera; None without one.
     """
@@ -206,11 +189,6 @@ class Scene:
     """What a robot meets.
 
     Attributes:
-        clip: the truth.
-        place: the map.
-        start: number of the first frame of the fault.
-        strength: of the fault.
-        shown: the frames that it is shown.
         hint: a wrong place that it is told at the start; None if it is told nothing.
     """
 
@@ -241,7 +219,7 @@ def staged(fault: str, plan: Plan, places: Places, rng: np.random.Generator) -> 
     clip, place = places.clip(plan), places.other if fault == OTHER_TOWN else places.own
     start = int(rng.integers(_BEFORE, max(_BEFORE + 1, len(clip) - _AFTER)))
     strength = _strength(fault, rng)
-    if fault in FROM_THE_FIRST:
+    if fault in FAULTS and FAULTS[fault].from_the_first:
         start = 0
     if fault == REVERSE:
         first = start - _BEFORE
@@ -292,27 +270,11 @@ class Trial:
     """Result of one trial.
 
     Attributes:
-        number: of the trial.
-        fault: a kind of `KINDS`.
-        clip: name of the clip.
-        start: number of the first frame of the fault.
-        strength: of the fault.
-        frames, fixes: how many there were.
-        false: fixes that are false.
-        events: runs of false fixes.
         worst_m: largest error of a fix, m; in another town 10 km.
         again: frames from the start of the fault until the first right fix; None if never.
-        expected: frames that were shown and have a right fix where nothing is wrong.
-        lost: those of them without a right fix.
-        driven_m: true length of the drive.
-        refused: findings of the doctor that are fatal.
         nodes, edges: what the drive added to the map, mapped with ``--force``; None where it was
             not mapped.
-        joined: edges among them that join two places, without those of odometry.
-        joined_odometry: those of odometry.
         worst_edge_m: the largest error of those edges, m.
-        map_refused: why mapping without ``--force`` refuses the drive.
-        made_by: versions of the method, and of what the number means; "" of earlier versions.
     """
 
     number: int
@@ -354,14 +316,7 @@ def read_trials(file: Path) -> list[Trial]:
 
 
 class TrialFile:
-    """A file of trials that is added to.
-
-    Args:
-        path: the file; made if there is none.
-
-    Raises:
-        ConfigError: it holds trials of other versions.
-    """
+    """A file of trials that is added to."""
 
     def __init__(self, path: Path) -> None:
         made = read_trials(path)

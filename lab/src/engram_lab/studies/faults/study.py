@@ -57,13 +57,7 @@ from engram_lab.truth import read_kitti_poses, read_matrix_truth
 
 
 def map_on(trial: Trial, scene: Scene, path: Path) -> None:
-    """Maps the scene into a copy of its map, and fills in what that did to it.
-
-    Args:
-        trial: gets what it tells of the map.
-        scene: what the robot meets.
-        path: the copy; replaced if it is there.
-    """
+    """Maps the scene into a copy of its map, and fills in what that did to it."""
     shutil.copyfile(scene.place.path, path)
     drive = ClipDrive(scene.clip.plan, [one.pair for one in scene.shown])
     begin = partial(_told, scene)
@@ -106,10 +100,7 @@ class RealDrive:
     """A real drive with truth.
 
     Attributes:
-        rig: name of its cameras.
-        folder, truth_file: below the folder of the data.
         read_truth: reads that file; gets the stamps of the frames, ns.
-        mapped, live: the frames of which the map is made, and those that are driven in it.
     """
 
     rig: str
@@ -142,13 +133,7 @@ DRIVES = {
 
 @dataclass(frozen=True, slots=True)
 class RealPlan:
-    """What a real clip shows; see `Plan`.
-
-    Attributes:
-        town: key in `DRIVES`.
-        part: "mapped"; "there", and back; "back", and there; or "whole", all frames as recorded.
-        data: folder of the real data.
-    """
+    """What a real clip shows; see `Plan`."""
 
     town: str
     part: str
@@ -175,11 +160,7 @@ class RealPlan:
         return False
 
     def read(self) -> Clip:
-        """The clip.
-
-        Raises:
-            SequenceError: images or truth cannot be used.
-        """
+        """The clip."""
         drive = DRIVES[self.town]
         pairs = [one for one in open_drive(self.data / drive.folder) if isinstance(one, StereoPair)]
         truth = drive.read_truth(self.data / drive.truth_file, [one.stamp_ns for one in pairs])
@@ -211,15 +192,19 @@ def real_plans() -> list[RealPlan]:
     named = os.environ.get("ENGRAM_DATA")
     if not named:
         return []
-    data = Path(named)
-    there = [town for town, drive in DRIVES.items() if (data / drive.folder).is_dir()]
-    return [RealPlan(town, part, data) for town in there for part in ("mapped", "there", "back")]
+    data, parts = Path(named), ("mapped", "there", "back")
+    return [RealPlan(town, part, data) for town in real_drives(data) for part in parts]
 
 
-def localised(scene: Scene) -> tuple[list[Fix], list[str]]:
+def real_drives(data: Path) -> list[str]:
+    """Names of the drives below a folder of real images."""
+    return [town for town, drive in DRIVES.items() if (data / drive.folder).is_dir()]
+
+
+def localised(scene: Scene, settings: Settings | None = None) -> tuple[list[Fix], list[str]]:
     """The fixes of a robot that meets a scene; fatal findings of its doctor."""
     clip, hint, fixes = scene.clip, scene.hint, list[Fix]()
-    with scene.place.opened.robot(clip.pairs[0].camera) as robot:
+    with scene.place.opened.robot(clip.pairs[0].camera, settings) as robot:
         for at, one in enumerate(scene.shown):
             if hint is not None and one.frame >= scene.start:
                 robot.place_at(hint)
@@ -230,14 +215,7 @@ def localised(scene: Scene) -> tuple[list[Fix], list[str]]:
 
 
 def run_trial(number: int, fault: str, scene: Scene, right: frozenset[int] = frozenset()) -> Trial:
-    """One drive with one fault, localised.
-
-    Args:
-        number: of the trial.
-        fault: its name.
-        scene: what the robot meets.
-        right: frames of the clip with a right fix where nothing is wrong.
-    """
+    """One drive with one fault, localised."""
     clip = scene.clip
     trial = Trial(number, fault, clip.plan.name, scene.start, scene.strength, made_by=MADE_BY)
     trial.driven_m = way_m(clip.world_from_cam)
@@ -274,14 +252,7 @@ def run(
     """Makes the trials up to a number that are missing from a file of results, by place.
 
     Args:
-        file: results, a line of JSON each; added to.
-        trials: how many in all.
         plans: the clips; None for those that are `available`.
-        monitor: receives the fault of each trial, and may stop the run.
-        only: the faults that are made; the trials of the others are left out.
-
-    Raises:
-        ConfigError: the file holds trials of other versions.
     """
     plans, made = available() if plans is None else plans, TrialFile(file)
     wanted = [(n, drawn(n, plans)) for n in range(trials) if fault_of(n) in only]

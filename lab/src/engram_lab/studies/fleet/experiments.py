@@ -42,18 +42,7 @@ def merged_name(groups: int, merges: int) -> str:
 
 
 def run_fleet(plan: FleetPlan, workers: int = 1, monitor: Monitor = QUIET) -> None:
-    """Runs what is missing of a study.
-
-    Args:
-        plan: what to run.
-        workers: processes.
-        monitor: hears of each task that is done.
-
-    Raises:
-        MapError: a map cannot be written, or no space is left.
-        MapLockedError: another run works in the same folder.
-        InputError: a drive cannot be read, or results cannot be written.
-    """
+    """Runs what is missing of a study."""
     plan.run(fleet_tasks(plan), workers, monitor, kept_maps.close)
 
 
@@ -68,13 +57,7 @@ def fleet_tasks(plan: FleetPlan) -> list[Task]:
 
 @dataclass(frozen=True, slots=True)
 class PairMerge:
-    """One merge of the pairwise tree.
-
-    Attributes:
-        level: merges of one level are made side by side.
-        name: of the map that it makes.
-        centre, robot: names of the maps that are merged.
-    """
+    """One merge of the pairwise tree."""
 
     level: int
     name: str

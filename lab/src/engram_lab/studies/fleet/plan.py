@@ -25,14 +25,7 @@ from engram_lab.studies.plan import StudyOptions, StudyPlan, all_tables, study_f
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """One way to do everything.
-
-    Attributes:
-        letter: key in `ARMS`.
-        words: for tables and legends.
-        driving: how drives are mapped, localised as on a robot, and judge orders of merging.
-        merging: how maps are merged.
-    """
+    """One way to do everything."""
 
     letter: str
     words: str
@@ -50,7 +43,6 @@ class ArmRule:
     """What an arm sets; all else is as the settings say.
 
     Attributes:
-        words: for tables and legends.
         policy: key of `POLICIES`, for driving and merging; None for those of the settings.
         lanes, rounds: Np and Nr of both, with the policy; counts only, so that the same input
             gives the same maps.
@@ -67,8 +59,6 @@ class ArmRule:
         """The arm under some settings.
 
         Args:
-            settings: the tables `drive` and `merge` say what the arm leaves open.
-            letter: key in `ARMS`.
             relocaliser: key of `RELOCALISERS`, for robots; None for none.
         """
         drive, merging = settings.drive, MergeOptions.of(settings.merge)
@@ -138,11 +128,6 @@ class FleetOptions(StudyOptions):
     """What a fleet study runs.
 
     Attributes:
-        arms: keys of `ARMS`.
-        experiments: numbers of [G16]'s figures.
-        groups: k of the parallel build.
-        more_groups: further k, on the first fold, to see how far more of them go.
-        order_groups: how many groups are merged in all orders. 4: [G16] §VI-E.
         tried: held-out drives of each fold that downloads are tried out on; None for all.
         relocaliser: of robots, as of every study, but by default the lost are found. Merges have
             that of the settings, where these tell of merging.
@@ -176,13 +161,7 @@ class FleetOptions(StudyOptions):
 
 @dataclass(frozen=True, slots=True)
 class Protocol:
-    """[G16]'s numbers of logs, as far as a fold's training sessions go.
-
-    Attributes:
-        foray: logs of each robot's forays, the first and the second; 7 where there are enough.
-        group: logs of each of the groups of the orders; 9 where there are enough.
-        validation: training sessions by which the best order is chosen.
-    """
+    """[G16]'s numbers of logs, as far as a fold's training sessions go."""
 
     foray: int
     group: int
@@ -190,11 +169,7 @@ class Protocol:
 
     @staticmethod
     def of(training: int, order_groups: int = 4) -> Protocol:
-        """For so many training sessions.
-
-        Raises:
-            ConfigError: too few for two robots with two forays each, or for the orders.
-        """
+        """For so many training sessions."""
         least = max(2 * 2, order_groups + 1)
         if training < least:
             raise ConfigError(
@@ -274,16 +249,6 @@ def make_fleet_plan(
     """A plan; its folder below `work` depends on all that its maps and results depend on.
 
     More arms or experiments may be run later, and find there what was done.
-
-    Args:
-        drives: what is evaluated.
-        settings: of all verbs; those of robots alone leave the others' tables as they are.
-        options: what is run.
-        work: folder of all studies.
-
-    Raises:
-        ConfigError: too few drives for the protocols, or a setting cannot be obeyed here: the
-            drives were made by another, or matches are made once for all.
     """
     check_logs(settings, drives)
     check_lost(settings, options.relocaliser)
@@ -321,15 +286,8 @@ class MergeRecord:
     """One merge into a centre.
 
     Attributes:
-        name: of the map handed in.
-        nodes: of the centre afterwards.
-        components: connected components of the centre afterwards.
-        taken, omitted: nodes.
-        frames: nodes that were replayed.
         attempts, proposed, lookups: match attempts, those of them at proposed nodes, and nodes for
             which the relocaliser was asked.
-        seconds: wall time.
-        in_force: what the centre keeps of how it was made.
     """
 
     name: str
@@ -353,10 +311,7 @@ class DownloadRecord:
         policy: key of `SELECTIONS`; another than was asked for where nothing was driven at that
             hour.
         start_h: hour of day that it was made for; None if it is not known.
-        nodes, of_nodes: sent, and of the centre.
-        united: sent, together with what the robot itself had saved and the centre knows.
         size_bytes, of_bytes: of the file, and of the centre's.
-        in_force: what the file keeps of how it was made.
     """
 
     policy: str

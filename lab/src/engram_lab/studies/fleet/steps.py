@@ -93,11 +93,6 @@ def map_drives(
     """Adds drives to a map, one after another, as far as they are missing.
 
     Args:
-        plan: the study.
-        arm: policy and budget.
-        fold: whose training sessions they are.
-        name: of the map.
-        drives: in the order in which they are mapped.
         base: name of the map that it begins as a copy of; None for an empty one.
     """
     path = map_path(plan, arm, fold, name)
@@ -167,18 +162,7 @@ def download_for_foray(
     own: Sequence[EvaluatedDrive],
     mission: Sequence[EvaluatedDrive],
 ) -> None:
-    """What a robot takes along to its second foray; the mission starts with its first drive.
-
-    Args:
-        plan: the study.
-        arm: policy and budget.
-        fold: whose training sessions they are.
-        name: of the download.
-        centre: name of the map that it is a part of.
-        policy: key of `SELECTIONS`.
-        own: the drives that the robot itself has handed in.
-        mission: the drives of the foray.
-    """
+    """What a robot takes along to its second foray; the mission starts with its first drive."""
     path = map_path(plan, arm, fold, name)
     record = path.with_suffix(".download.json")
     if path.exists() and record.exists():
@@ -258,14 +242,7 @@ _FRAME_STAGES = ("neighbourhood", "rank", "remember")
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """What was done, on whatever machine.
-
-    Attributes:
-        frames: localised, or tried to.
-        attempts: match attempts.
-        proposed: how many of them at nodes that were proposed to a lost robot.
-        lookups: how often the relocaliser was asked.
-    """
+    """What was done, on whatever machine."""
 
     frames: int
     attempts: int
@@ -278,11 +255,8 @@ class StageTimes:
     """Medians on one core.
 
     Attributes:
-        frame_ms: of a frame: carrying on, neighbourhood, ranking, remembering.
-        attempt_ms: of one match attempt where something was expected.
         proposed_ms: of one in vain at a node that was proposed to a lost robot. Of the many that
             it makes one at most finds it; that one costs more.
-        lookup_ms: of asking the relocaliser.
     """
 
     frame_ms: float
@@ -336,12 +310,6 @@ def medians(
     drives: Sequence[Path], centre: Path, settings: Settings, options: RobotOptions
 ) -> dict[str, float]:
     """What each stage takes, in one pass.
-
-    Args:
-        drives: frame logs of drives that the map does not hold.
-        centre: the map.
-        settings: the resolved configuration.
-        options: policy and budget; one lane, so that attempts are made one after another.
 
     Returns:
         Medians by the names of `StageTimes`, ms; 0 for what did not happen.
@@ -416,16 +384,7 @@ class TriedDownload:
     """One held-out drive in one download.
 
     Attributes:
-        name: of the kind of download.
-        nodes, of_nodes: sent, and of the centre.
-        united: sent, together with the robot's own; mean over the robots.
-        size_bytes: of the file.
         expected_missed: share of the way without a match, as promised.
-        drive: steps and matches.
-        ms: mean time of localising a frame.
-        lookup_ms: of that, asking the relocaliser.
-        lookups: frames for which it was asked.
-        in_force: the settings that it was chosen by.
     """
 
     name: str
@@ -584,14 +543,7 @@ class _Judge:
 
 
 def try_orders(plan: FleetPlan, arm: Arm, fold: Fold, names: Sequence[str]) -> None:
-    """Merges the groups in all orders, and keeps the results in ``orders.json``.
-
-    Args:
-        plan: the study.
-        arm: policy and budget.
-        fold: whose held-out drives are reported on.
-        names: of the groups' maps.
-    """
+    """Merges the groups in all orders, and keeps the results in ``orders.json``."""
     folder = plan.folder(arm, fold)
     path = folder / "orders.json"
     if path.exists():

@@ -1,14 +1,33 @@
-"""The soak compares blocks of the same frames, in a map whose lanes are candidates."""
+"""Checks on small cases: random maps that are merged, a long drive."""
 
-from pathlib import Path
+from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.builders import World, drive
 
 from engram.geometry.se3 import SE3
-from engram.localiser.localisation import Position
-from engram.maps.map import Map
-from engram_lab.checks import soak
+from engram.sequences.sequence import LoggedFrame
+from engram_lab.checks import merge_graphs, soak
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_must_hold_of_a_merge_holds_for_random_maps(seed):
+    assert merge_graphs.told(seed).violations == []
+
+
+def test_a_centre_without_edges_can_be_downloaded_from():
+    case = merge_graphs.told(46)
+    assert (case.violations, case.sent) == ([], "copy")
+
+
+@pytest.mark.long
+def test_what_must_hold_of_a_merge_holds_for_many_random_maps():
+    cases = [merge_graphs.told(seed) for seed in range(1000, 1100)]
+    assert [found for case in cases for found in case.violations] == []
+    assert {"copy", "tod", "paths", "tod+paths", "budget", "region"} <= {
+        case.sent for case in cases
+    }
 
 
 def test_each_pair_of_blocks_starts_at_the_same_frame() -> None:
@@ -31,22 +50,9 @@ def test_each_pair_of_blocks_starts_at_the_same_frame() -> None:
     assert figures["a frame old"] == pytest.approx(6.0)
 
 
-def test_a_robot_beside_the_road_has_its_lanes_as_candidates_and_saves_nodes(
-    tmp_path: Path,
-) -> None:
-    beside = soak.write_road(tmp_path / "road.engram", 200)
-    with Map.open(tmp_path / "road.engram") as opened:
-        robot = opened.robot(soak.CAMERA, name="r", maps=True, relocaliser=None)
-    with robot:
-        robot.place_at(Position(beside, SE3(np.eye(3), np.array([1.5, 0, 0])), np.eye(6) * 1e-4))
-        steps = [robot.step(soak.lane_frame(number)) for number in range(30)]
-    assert not any(one.localised for one in steps)
-    assert sum(one.saved is not None for one in steps) == 6
-    assert steps[-1].candidates > 20
-
-
 def test_there_and_back_ends_where_it_began() -> None:
-    entries = [soak.lane_frame(number) for number in range(4)]
+    seen = drive(World(6.0), np.arange(4.0), 0, start_ns=0, seed=0)
+    entries = [LoggedFrame(one.frame, one.odometry) for one in seen]
     frame_at = soak.there_and_back(entries)
     lap = [frame_at(number) for number in range(1, 7)]  # 1 2 3 2 1 0
     pose = SE3.identity()

@@ -1,7 +1,8 @@
-"""`engram lab try` as its users meet it."""
+"""The laboratory's verbs: studies, the town, downloads that are tried."""
 
 from __future__ import annotations
 
+import math
 import shutil
 from pathlib import Path
 
@@ -11,6 +12,94 @@ from tests.cli.conftest import engram
 from engram.robot.mapping import extract_log, map_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.sequences.opening import open_drive
+
+__all__ = ["engram"]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--policies", "distance", "--redo", "path"), "--redo 'path': not among the policies"),
+        (("--redo", "nonsense"), "--redo 'nonsense': not among the policies"),
+        (("--redo", "path", "--report-only"), "--report-only runs nothing"),
+        (("--policies", "distanec"), "no ranking policy 'distanec'"),
+        (("--only-folds", "5"), "5"),
+        (("hamlet",), "campaign 'hamlet' is given twice"),
+        (("--relocaliser", "fabmapp"), "relocaliser 'fabmapp' is unknown"),
+        (("--lanes", "0,-1"), "must be whole numbers from 1 on"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_before_anything_is_run(
+    engram, tmp_path: Path, options: tuple[str, ...], said: str
+) -> None:
+    ran = engram("lab", "evaluate", "ranking", "hamlet", *options, "--work", tmp_path / "work")
+    assert ran.status == 2
+    assert said in ran.err
+    assert not (tmp_path / "work").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("hamlett", "hamlett"),
+        ("hamlet@x", "the seed after @ must be a whole number"),
+        ("hamlet@-1", "-1"),
+    ],
+)
+def test_a_campaign_that_is_none_is_told_as_such(engram, tmp_path: Path, name: str, said: str):
+    ran = engram("lab", "evaluate", "ranking", name, "--campaigns", tmp_path / "none")
+    assert ran.status == 2
+    assert said in ran.err
+    assert ("whole number" in ran.err) == ("whole number" in said)
+
+
+def test_a_campaigns_name_is_the_campaign_though_a_folder_has_it_too(
+    engram, tmp_path: Path, monkeypatch
+) -> None:
+    (tmp_path / "hamlet").mkdir()
+    monkeypatch.chdir(tmp_path)
+    ran = engram("lab", "evaluate", "ranking", "hamlet", "--campaigns", tmp_path / "none")
+    assert ran.status == 2
+    assert "sessions are not rendered" in ran.err
+    other = engram("lab", "evaluate", "ranking", "hamlet/", "--campaigns", tmp_path / "none")
+    assert "is not a frame log" in other.err
+
+
+__all__ = ["engram"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("bench", "--only", "warp"), "warp"),
+        (("simulate", "atlantis"), "atlantis"),
+        (("simulate", "hamlet", "--size", "huge"), "huge"),
+        (("simulate", "hamlet", "--sessions", "9"), "not 9"),
+        (("simulate", "hamlet", "--sessions", "one"), "one"),
+        (("simulate", "hamlet", "--sessions", ""), "--sessions ''"),
+        (("simulate", "hamlet", "--sessions", "0,"), "--sessions '0,'"),
+    ],
+)
+def test_bad_input_is_one_clear_line_and_status_two(
+    engram, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], says: str
+) -> None:
+    monkeypatch.setenv("ENGRAM_CAMPAIGNS", str(tmp_path))
+    ran = engram("lab", *arguments)
+    assert ran.status == 2
+    assert ran.err.startswith("engram: ")
+    assert says in ran.err
+    assert "Traceback" not in ran.err
+
+
+def test_bench_gives_the_documented_json(engram) -> None:
+    ran = engram("lab", "bench", "--only", "attempt_512,rank_path_150", "--repeats", 3, "--json")
+    stages = ran.json["stages"]
+    assert set(stages) == {"attempt_512", "rank_path_150"}
+    for stage in stages.values():
+        assert {"ms", "p99_ms", "reference_ms", "ratio"} <= set(stage)
+        assert math.isfinite(stage["ms"])
+    assert ran.json["machine"]
+
 
 __all__ = ["engram"]
 

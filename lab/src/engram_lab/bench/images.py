@@ -1,4 +1,4 @@
-"""Windowed joint optimisation on a problem with a known solution."""
+"""Stages of the renderer, and of the window on a problem with a known solution."""
 
 from __future__ import annotations
 
@@ -9,8 +9,34 @@ import numpy as np
 from engram import _core
 from engram.geometry.se3 import SE3
 from engram_lab.bench.data import BenchData
-from engram_lab.bench.plain import PlainPipeline
-from engram_lab.bench.stage import Prepared
+from engram_lab.bench.stage import PlainPipeline, Prepared
+from engram_lab.town.campaigns import campaign_named
+from engram_lab.town.session import SimulatedDrive
+
+CLEAR, RAIN, NIGHT = 1, 6, 7  # sessions of `village`: a morning, wet streets, lamps
+_FIRST_FRAME, _SHOWN = 200, 60
+
+
+def prepare_rendering(
+    data: BenchData, plain: PlainPipeline | None, *, session: int = CLEAR
+) -> Prepared:
+    """The pairs follow each other as in a drive; the tiles around them are built beforehand."""
+    del data, plain
+    drive = SimulatedDrive(campaign_named("village"), session)
+    for _ in drive.frames(_FIRST_FRAME, _FIRST_FRAME + _SHOWN):
+        pass
+    frames = drive.frames(_FIRST_FRAME, _FIRST_FRAME + _SHOWN)
+
+    def ours(_: int) -> dict[str, int]:
+        nonlocal frames
+        pair = next(frames, None)
+        if pair is None:  # round again
+            frames = drive.frames(_FIRST_FRAME, _FIRST_FRAME + _SHOWN)
+            pair = next(frames)
+        return {"pixels": 2 * pair.left.size}
+
+    return Prepared(ours)
+
 
 _FRAMES, _LANDMARKS = 7, 528
 _PIXEL_SIGMA_PX, _DISPARITY_SIGMA_PX = 0.5, 0.1

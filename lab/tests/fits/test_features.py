@@ -24,8 +24,7 @@ def test_no_visit_that_is_trained_on_is_judged() -> None:
 
 
 def test_integers_give_nearly_all_bits_of_the_trained_network() -> None:
-    from engram_lab.fits.feature_network import PatchNetwork
-    from engram_lab.fits.feature_weights import integer_weights, weights_file
+    from engram_lab.fits.features import PatchNetwork, integer_weights, weights_file
 
     torch.manual_seed(1)
     rng = np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""The drives that ship are what their program renders."""
+"""The demo: what it tells, and the drives that ship."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 
 from engram.sample import drives
 from engram_lab.demo.sample_drives import PARTS, encoded, write_facts
+from engram_lab.demo.story import run_demo
 
 SHIPPED = Path(drives.__file__).parent / "data"
 
@@ -39,3 +40,17 @@ def test_the_drives_that_ship_are_whole_and_small() -> None:
     files = [one for one in SHIPPED.rglob("*") if one.is_file()]
     assert len([one for one in files if one.suffix == ".jpg"]) == 2 * 2 * 40
     assert sum(one.stat().st_size for one in files) < 6.5e6
+
+
+@pytest.mark.long
+def test_the_demo_shows_that_paths_find_more_with_fewer_attempts(tmp_path: Path) -> None:
+    report = run_demo(tmp_path / "demo")
+    distance, path = report.localised["distance"], report.localised["path-near"]
+    # At one attempt a frame, 71 and 100 % of the frames are localised.
+    assert path[1]["share_localised"] > distance[1]["share_localised"] + 0.1
+    assert path[4]["share_localised"] >= distance[4]["share_localised"]
+    assert path[4]["attempts_per_frame"] < distance[4]["attempts_per_frame"]
+    assert len(report.mapped) + 1 == len(report.conditions) == 6
+    for name in ("one_place.png", "map_from_above.png", "attempts.png"):
+        assert (report.out / name).stat().st_size > 10_000
+    assert list((report.out / "matches_path-near_4").glob("*_localised.png"))
