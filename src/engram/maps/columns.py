@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Table, select
+from sqlalchemy import Connection, Table
 
 from engram import _core
 from engram.errors import MapCorruptError
 from engram.maps.rows import describe, mismatch
-from engram.maps.schema import revisions
-from engram.maps.view import View, place_in_history
+from engram.maps.view import View, places_in_history
 
 _KINDS = {int: "i", float: "f", str: "s"}
 
@@ -80,7 +79,7 @@ def read_columns(
         {name: array for name, array in named.items() if not isinstance(array, tuple)},
         {name: array for name, array in named.items() if isinstance(array, tuple)},
     )
-    return _in_history(connection, view, whole)
+    return _in_history(connection, whole)
 
 
 def verified_arrays(
@@ -100,12 +99,9 @@ def verified_arrays(
     return {column.name: array for column, array in zip(columns, arrays, strict=True)}
 
 
-def _in_history(connection: Connection, view: View, columns: Columns) -> Columns:
+def _in_history(connection: Connection, columns: Columns) -> Columns:
     """Rows that are ordered by key, ordered by revision and then by key."""
-    query = select(revisions.c.key, place_in_history()).where(
-        revisions.c.key.in_(view.revision_keys())
-    )
-    place_of = dict(map(tuple, connection.execute(query)))
+    place_of = places_in_history(connection)
     known, which = np.unique(columns["revision"], return_inverse=True)
     place = np.array([place_of[key] for key in known.tolist()], np.int64)[which]
     if (np.diff(place) >= 0).all():

@@ -35,7 +35,7 @@ from engram.maps.schema import (
     sessions,
 )
 from engram.maps.totals import Own, own_rows
-from engram.maps.view import View
+from engram.maps.view import View, few
 
 _encode = msgspec.msgpack.Encoder().encode
 
@@ -55,8 +55,6 @@ _REFERENCES = {
 _HASHED = tuple(table for table in VERSIONED if table not in {frames, placements})
 _LEFT_OUT = {"key", "checksum"}
 _HISTORY = ("number", "parent", "author", "message", "tool_version", "configuration")
-# Keys in one statement.
-_FEW = 500
 
 
 def content_hash(connection: Connection, at: int) -> str:
@@ -181,8 +179,8 @@ class Identities:
         known = self._known[table]
         wanted = sorted(set(keys) - known.keys())
         uuids = metadata.tables[table]
-        for at in range(0, len(wanted), _FEW) if "uuid" in uuids.c else ():
-            query = select(uuids.c.key, uuids.c.uuid).where(uuids.c.key.in_(wanted[at : at + _FEW]))
+        for part in few(wanted) if "uuid" in uuids.c else ():
+            query = select(uuids.c.key, uuids.c.uuid).where(uuids.c.key.in_(part))
             known.update(map(tuple, self._connection.execute(query)))
         missing = [key for key in wanted if key not in known]
         if missing:
@@ -280,8 +278,8 @@ def _canonical_targets(
 ) -> dict[int, bytes]:
     """The rows of these keys; of attempts, with all others of their revision and session."""
     found: dict[int, bytes] = {}
-    for at in range(0, len(keys), _FEW):
-        which = table.c.key.in_(keys[at : at + _FEW])
+    for part in few(keys):
+        which = table.c.key.in_(part)
         if table is attempts:
             pairs = select(attempts.c.session, attempts.c.revision).where(which).distinct()
             for session, revision in connection.execute(pairs).fetchall():

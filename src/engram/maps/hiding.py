@@ -31,7 +31,8 @@ from engram.maps.schema import (
     revisions,
     sessions,
 )
-from engram.maps.view import KeyBook, View
+from engram.maps.totals import own_rows
+from engram.maps.view import KeyBook, View, few
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,19 +129,24 @@ def hide_revision(
     Raises:
         RevisionError: nothing of it is visible.
     """
-    query = select(revisions.c.key).where(revisions.c.number == number)
-    target = connection.execute(query).scalar_one()
-    written = _invert_hidden(connection, keys, view, target, revision_key)
+    query = select(revisions).where(revisions.c.number == number)
+    own = own_rows(next(verified(revisions, connection.execute(query))))
+    written = _invert_hidden(connection, keys, view, own.key, revision_key)
     # Owners last: they stay visible while any visible row belongs to them.
     owned = [table for table in VERSIONED if table not in {hidden, frames, paths, sessions}]
     for table in (*owned, paths, sessions):
         brought = (
             select(table.c.key)
-            .where(table.c.revision == target, table.c.key.not_in(view.hidden_keys(table)))
+            .where(own.rows(table), table.c.key.not_in(view.hidden_keys(table)))
             .order_by(table.c.key)
         )
-        found = set(connection.execute(brought).scalars()) - _used(connection, view, table)
-        rows = [hidden_row(keys, revision_key, table, one, hide=True) for one in sorted(found)]
+        found = list(connection.execute(brought).scalars())
+        used = _used(connection, view, table, found)
+        rows = [
+            hidden_row(keys, revision_key, table, one, hide=True)
+            for one in found
+            if one not in used
+        ]
         if rows:
             connection.execute(insert(hidden), rows)
         written += len(rows)
@@ -148,15 +154,20 @@ def hide_revision(
         raise RevisionError(f"revision {number} has nothing to revert: none of its rows is visible")
 
 
-def _used(connection: Connection, view: View, table: Table) -> set[int]:
-    """Keys of sessions or paths that own visible rows."""
+def _used(connection: Connection, view: View, table: Table, found: list[int]) -> set[int]:
+    """Those of these sessions or paths that own visible rows."""
     owned = {sessions: (nodes, paths, attempts), paths: (path_entries,)}.get(table, ())
     column = {sessions: "session", paths: "path"}.get(table, "")
     return {
         key
         for owner in owned
+        for part in few(found)
         for key in connection.execute(
-            view.select(owner).with_only_columns(owner.c[column]).distinct().order_by(None)
+            view.select(owner)
+            .with_only_columns(owner.c[column])
+            .where(owner.c[column].in_(part))
+            .distinct()
+            .order_by(None)
         ).scalars()
     }
 

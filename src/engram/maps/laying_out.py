@@ -21,12 +21,9 @@ from engram.maps.rows import (
     verified,
 )
 from engram.maps.runs import Keys, Runs
-from engram.maps.schema import edges, nodes, placements, revisions, sessions
+from engram.maps.schema import edges, nodes, placements, sessions
 from engram.maps.totals import Own, Totals, state_at_head, supersedes
-from engram.maps.view import View, place_in_history
-
-# Keys in one statement.
-_FEW = 500
+from engram.maps.view import View, few, places_in_history
 
 
 def new_places(
@@ -98,19 +95,18 @@ def _rest(totals: Totals, runs: Runs, placed: Keys) -> Surroundings:
 def _older(connection: Connection, view: View, keys: Keys) -> list[Row]:
     """Rows of nodes of earlier revisions, in the order of a graph that is read."""
     found: list[Row] = []
-    for at in range(0, len(keys), _FEW):
-        query = view.select(nodes).where(nodes.c.key.in_(keys[at : at + _FEW].tolist()))
+    for part in few(keys.tolist()):
+        query = view.select(nodes).where(nodes.c.key.in_(part))
         found += verified(nodes, connection.execute(query))
-    order = select(revisions.c.key, place_in_history()).order_by(revisions.c.key)
-    place_of = dict(map(tuple, connection.execute(order)))
+    place_of = places_in_history(connection)
     return sorted(found, key=lambda row: (place_of[row["revision"]], row["key"]))
 
 
 def _places(connection: Connection, view: View, keys: list[int]) -> dict[int, SE3]:
     """The newest place of each node that has one."""
     found = {}
-    for at in range(0, len(keys), _FEW):
-        query = view.select(placements).where(placements.c.node.in_(keys[at : at + _FEW]))
+    for part in few(keys):
+        query = view.select(placements).where(placements.c.node.in_(part))
         for row in verified(placements, connection.execute(query)):
             found[row["node"]] = transform_from_bytes(row["map_from_node"], "a placement")
     return found
@@ -118,10 +114,9 @@ def _places(connection: Connection, view: View, keys: list[int]) -> dict[int, SE
 
 def _nodes(connection: Connection, rows: list[Row]) -> list[Node]:
     cameras = load_cameras(connection)
-    wanted = sorted({row["session"] for row in rows})
     drives = {}
-    for at in range(0, len(wanted), _FEW):
-        query = select(sessions).where(sessions.c.key.in_(wanted[at : at + _FEW]))
+    for part in few(sorted({row["session"] for row in rows})):
+        query = select(sessions).where(sessions.c.key.in_(part))
         for row in verified(sessions, connection.execute(query.order_by(sessions.c.key))):
             drives[row["key"]] = session_from_row(row, cameras[row["camera"]].id).id
     return [node_from_row(row, drives[row["session"]], cameras[row["camera"]].id) for row in rows]

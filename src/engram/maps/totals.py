@@ -35,14 +35,12 @@ from engram.maps.schema import (
     revisions,
     sessions,
 )
-from engram.maps.view import LARGEST_KEY, View, place_in_history
+from engram.maps.view import LARGEST_KEY, View, few, places_in_history
 
 _EDGE_BYTES = {"a_from_b": 96, "covariance": 168}
 _NODE_BYTES = {"uuid": 16, "landmark_hash": 16}
 # Rows read at once.
 _AT_ONCE = 100_000
-# Keys in one statement.
-_FEW = 500
 
 _Key = Annotated[int, msgspec.Meta(ge=0, le=LARGEST_KEY)]
 Forward = Mapping[CameraId, tuple[float, float, float]]
@@ -298,8 +296,8 @@ class _Owners:
             MapCorruptError: one is missing.
         """
         rows = []
-        for at in range(0, len(keys), _FEW):
-            query = select(nodes).where(nodes.c.key.in_(keys[at : at + _FEW].tolist()))
+        for part in few(keys.tolist()):
+            query = select(nodes).where(nodes.c.key.in_(part))
             found = verified(nodes, self._connection.execute(query.order_by(nodes.c.key)))
             rows += [(row["key"], row["session"], row["camera"]) for row in found]
         if len(rows) != len(keys):
@@ -408,20 +406,12 @@ def _right_m(connection: Connection, view: View) -> float | None:
         for part in _stretches(connection, view, placements, {"map_from_node": 96})
     ]
     node, revision, key, x_m = (np.concatenate(one) for one in zip(*parts, strict=True))
-    place = _places(connection, view, revision)
+    place_of = places_in_history(connection)
+    known, which = np.unique(revision, return_inverse=True)
+    place = np.array([place_of[one] for one in known.tolist()], np.int64)[which]
     order = np.lexsort((key, place, node))
     newest = np.flatnonzero(np.diff(node[order], append=-1))
     return _greater(None, x_m[order][newest])
-
-
-def _places(connection: Connection, view: View, revision: Keys) -> Keys:
-    """(N,) places in history of the revisions with these keys."""
-    query = select(revisions.c.key, place_in_history()).where(
-        revisions.c.key.in_(view.revision_keys())
-    )
-    place_of = dict(map(tuple, connection.execute(query)))
-    known, which = np.unique(revision, return_inverse=True)
-    return np.array([place_of[key] for key in known.tolist()], np.int64)[which]
 
 
 def _greater(known: float | None, values: NDArray[np.float64]) -> float | None:

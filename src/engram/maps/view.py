@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeVar
 
 from sqlalchemy import (
     ColumnElement,
@@ -26,6 +27,8 @@ from engram.maps.sqlite import SqliteDatabase
 
 # Rows of the writer's own open revision are newer than all committed ones.
 _NEWEST = 2**62
+_FEW = 500
+_Key = TypeVar("_Key")
 # Rows that refer to a hidden node are hidden with it.
 _NODE_COLUMNS = {"a", "b", "node"}
 
@@ -109,6 +112,18 @@ def _visible(view: View, table: Table) -> Select[tuple[object, ...]]:
 def place_in_history() -> ColumnElement[int]:
     """Order of revisions: by number, with an open one last."""
     return func.coalesce(revisions.c.number, _NEWEST)
+
+
+def places_in_history(connection: Connection) -> dict[int, int]:
+    """`place_in_history` of all revisions, by key."""
+    query = select(revisions.c.key, place_in_history()).order_by(revisions.c.key)
+    return dict(map(tuple, connection.execute(query)))
+
+
+def few(keys: Sequence[_Key]) -> Iterator[Sequence[_Key]]:
+    """Parts of keys, each no more than one statement takes."""
+    for at in range(0, len(keys), _FEW):
+        yield keys[at : at + _FEW]
 
 
 def head(connection: Connection) -> int:
