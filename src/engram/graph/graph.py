@@ -432,10 +432,11 @@ class ExperienceGraph:
 
     def _numbers(self, a: int, b: int, kind: EdgeKind) -> list[int]:
         """The indices in `edges` of the edge of this key, as its ends have them."""
-        number, kinds, targets = _KIND_NUMBER[kind], self._kinds.rows, self._target.rows
-        found = []
+        number, found = _KIND_NUMBER[kind], []
         for source, target, side in ((a, b, 0), (b, a, 1)):
-            for half in self._halves(source):
+            halves = list(self._halves(source))  # this may read a page
+            kinds, targets = self._kinds.rows, self._target.rows
+            for half in halves:
                 if half % 2 == side and targets[half] == target and kinds[half // 2] == number:
                     found.append(half // 2)
                     break
@@ -643,9 +644,12 @@ class ExperienceGraph:
         weights = np.array([weight(edge) for edge in self._edges], np.float64)
         return Links.lightest(self.edge_ends, weights)
 
-    def edges_of(self, node: int) -> list[Edge]:
-        """The edges at a node, newest key first."""
-        return [edge for edge, _ in self.numbered_edges_of(node)]
+    def edges_of(self, node: int, kind: EdgeKind | None = None) -> list[Edge]:
+        """The edges at a node, newest key first; of one kind, if it is given."""
+        edges = [half // 2 for half in self._halves(node)]
+        if kind is not None:
+            edges = [one for one in edges if self._kinds.rows[one] == _KIND_NUMBER[kind]]
+        return [self._edges[one] for one in edges]
 
     def numbered_edges_of(self, node: int) -> list[tuple[Edge, int]]:
         """The edges at a node, newest key first, each with its index in `edges`."""
@@ -665,11 +669,10 @@ class ExperienceGraph:
     def beside(self, node: int, reach_m: float) -> NDArray[np.int32]:
         """(K,) int32: nodes joined to a node by an edge of at most `reach_m`."""
         found: set[int] = set()
-        poses, targets = self._a_from_b.rows, self._target.rows
         for half in self._halves(node):
-            b_in_a = poses[half // 2, 9:]
+            b_in_a = self._a_from_b.rows[half // 2, 9:]
             if math.sqrt(b_in_a @ b_in_a) <= reach_m:
-                found.add(int(targets[half]))
+                found.add(int(self._target.rows[half]))
         return np.array(sorted(found), np.int32)
 
     def neighbourhood(

@@ -29,7 +29,7 @@ from engram.graph.model import Edge, EdgeKind, Node, NodeId, SessionId
 # Nodes of a page: what a search turns to next mostly lies in the same one.
 PAGE = 64
 # Of an edge in memory, with its covariance, and of the half edges that it has.
-_EDGE_BYTES = 500
+_EDGE_BYTES = 600
 DEFAULT_BUDGET_BYTES = 48 * 2**20
 
 # Pages that the search for one node reads at most: some 4,000 nodes around.

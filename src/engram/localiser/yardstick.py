@@ -159,8 +159,8 @@ class Yardstick:
         node = self._graph.node(index)
         beside = [
             (self._graph.index(edge.b if edge.a == node.id else edge.a), edge)
-            for edge in self._graph.edges_of(index)
-            if edge.kind is EdgeKind.ODOMETRY and edge.a_from_b.distance_m <= _NEIGHBOUR_M
+            for edge in self._graph.edges_of(index, EdgeKind.ODOMETRY)
+            if edge.a_from_b.distance_m <= _NEIGHBOUR_M
         ]
         behind = [one for one, edge in beside if edge.b == node.id]
         ahead = [one for one, edge in beside if edge.a == node.id]

@@ -121,31 +121,31 @@ class PagedLessons:
 
     Args:
         evidence: of the nodes from a dense index up to another one; its answers never change.
+        end: no node with evidence has this dense index or a larger one.
         config: how they count.
     """
 
     def __init__(
-        self, evidence: Callable[[int, int], Evidence], config: LessonsConfig = LessonsConfig()
+        self,
+        evidence: Callable[[int, int], Evidence],
+        end: int,
+        config: LessonsConfig = LessonsConfig(),
     ) -> None:
-        self._evidence, self._config = evidence, config
-        self._pages: dict[int, NDArray[np.float64]] = {}
+        self._evidence, self._end, self._config = evidence, end, config
+        # Zeros that nobody has written or read take no memory.
+        pages = end // PAGE + 1
+        self._log_odds = np.zeros(pages * PAGE)
+        self._is_learnt = np.zeros(pages, np.bool_)
 
     def log_odds_of(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
         """(Y,) float64: log odds of the probabilities of nodes, (Y,) dense indices."""
-        found = np.empty(len(nodes))
-        pages = nodes // PAGE
-        for page in np.unique(pages).tolist():
-            rows = pages == page
-            found[rows] = self._of_page(page)[nodes[rows] - page * PAGE]
-        return found
-
-    def _of_page(self, page: int) -> NDArray[np.float64]:
-        known = self._pages.get(page)
-        if known is None:
-            if len(self._pages) == _MOST_PAGES:
-                self._pages.clear()
-            known = self._pages[page] = self._learnt(page)
-        return known
+        known = np.minimum(nodes, self._end)
+        pages = known // PAGE
+        if not self._is_learnt[pages].all():
+            for page in np.unique(pages[~self._is_learnt[pages]]).tolist():
+                self._log_odds[page * PAGE : (page + 1) * PAGE] = self._learnt(page)
+                self._is_learnt[page] = True
+        return self._log_odds[known]
 
     def _learnt(self, page: int) -> NDArray[np.float64]:
         """(PAGE,) float64: the log odds of the nodes of a page."""
@@ -158,10 +158,6 @@ class PagedLessons:
         here = (around.nodes >= first) & (around.nodes < first + PAGE)
         base[around.nodes[here] - first] = learnt[here]
         return np.asarray(np.log(base / (1 - base)))
-
-
-# Pages of lessons in memory: 5 MB.
-_MOST_PAGES = 8192
 
 
 def _shared(

@@ -145,7 +145,7 @@ def _by_pages(opened: Map, focal_px: float, config: LocaliserConfig) -> _Known:
     graph, pages = opened.read_graph(), opened.pages
     basin, evidence = opened.derived(_past_drives, focal_px, config.basin)
     paths = PathMemory(graph, config.path_entries.kinds, pages)
-    return _Known(graph, paths, PagedLessons(evidence, config.lessons), basin)
+    return _Known(graph, paths, PagedLessons(evidence, pages.end, config.lessons), basin)
 
 
 def _past_drives(
