@@ -46,7 +46,19 @@ from engram_lab.mutations.case import Case, Subject
 _STUCK_S = 300.0
 # Functions of SQL that Engram's own statements call.
 _OWN_FUNCTIONS = frozenset(
-    {"count", "sum", "max", "min", "length", "substr", "quote", "like", "coalesce", "row_number"}
+    {
+        "count",
+        "sum",
+        "max",
+        "min",
+        "length",
+        "substr",
+        "instr",
+        "quote",
+        "like",
+        "coalesce",
+        "row_number",
+    }
 )
 _AUTHORISE_FUNCTION = 31
 # What no reader of a file does; see "Audit events table" of Python.
