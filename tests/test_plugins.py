@@ -139,10 +139,3 @@ def test_a_broken_verb_says_so_and_leaves_the_others_alone(added) -> None:
     ran = CliRunner().invoke(app, ["one", "thing", "--fast"])
     assert isinstance(ran.exception, IncompatibleError)
     assert "verb 'one' of package-0" in str(ran.exception)
-
-
-def test_added_layouts_stand_in_the_help_of_format(added) -> None:
-    added("engram.readers", "SOMETHING", name="shots")
-    shown = " ".join(CliRunner().invoke(app, ["localise", "--help"]).output.split())
-    assert f"{', '.join(layout_names())} [default: detected]." in shown
-    assert layout_names()[-1] == "shots"
