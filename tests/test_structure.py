@@ -16,7 +16,6 @@ _LONG = {
     "cli/drive.py": {"live"},
     "cli/drives.py": {"localise"},
     "fleet/cli/verbs.py": {"build", "download", "merge"},
-    "cli/localising.py": {"localise_and_print"},
 }
 _MANY_PARAMETERS = {
     "fleet/merge/merging.py": {"merge"},

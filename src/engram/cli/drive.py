@@ -7,6 +7,7 @@ import shlex
 import signal
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -58,18 +59,18 @@ def info(
     from engram.sequences.sequence import OpenOptions
 
     if is_bag(path):
-        options = OpenOptions.of(opening.over(settings.read()))
-        facts = describe_bag(path, options)
+        asked = OpenOptions.of(opening.over(settings.read()))
+        facts = describe_bag(path, asked)
         more = [*opening.typed("left", "right", "calibration", "motion"), *settings.typed()]
         if facts.command and more:
             facts = replace(facts, command=f"{facts.command} {shlex.join(more)}")
-        typer.echo(json.dumps(plain(facts)) if as_json else _bag_text(facts))
+        options.show(plain(facts), partial(_bag_text, facts), as_json=as_json)
         if facts.lost or facts.question:
             raise typer.Exit(3 if facts.lost else 2)
         _judge(facts.faulty_share)
         return
     found = _drive_facts(path, opening, settings)
-    typer.echo(json.dumps(found) if as_json else _drive_text(found))
+    options.show(found, partial(_drive_text, found), as_json=as_json)
     _judge(found["faulty_share"])
 
 

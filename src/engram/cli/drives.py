@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -125,12 +125,10 @@ def map_(
                     viewer.watch(begun.robot, begun.opened)
 
             report = map_drive(map_path, sequence, resolved, asked, monitor, begin, features)
-        if as_json:
-            print(json.dumps(report.to_dict()))
-        else:
-            for warning in warnings(report.to_dict()):
-                typer.echo(warning, err=True)
-            typer.echo(mapped_text(report.to_dict(), map_path))
+        done = report.to_dict()
+        for warning in () if as_json else warnings(done):
+            typer.echo(warning, err=True)
+        options.show(done, partial(mapped_text, done, map_path), as_json=as_json)
         if report.interrupted:
             raise typer.Exit(ExitStatus.INTERRUPTED)
 
@@ -287,10 +285,7 @@ def record(
     with losses_told(sequence):
         with Bars().stage("record", len(sequence)) as monitor:
             report = extract_log(sequence, out, resolved, monitor)
-        if as_json:
-            print(json.dumps(report.to_dict()))
-        else:
-            typer.echo(report.text())
+        options.show(report, as_json=as_json)
         if report.interrupted:
             raise typer.Exit(ExitStatus.INTERRUPTED)
         if report.diagnosis is not None:
@@ -385,7 +380,7 @@ def doctor(
         if pictures is not None:
             _draw(pictures, pairs)
             _draw_fixed(pictures, pairs, diagnosis, getattr(sequence, "cameras", None))
-        print(json.dumps(diagnosis.to_dict()) if as_json else diagnosis.text())
+        options.show(diagnosis, as_json=as_json)
         if diagnosis.fatal:
             raise typer.Exit(ExitStatus.UNFIT_DRIVE)
 

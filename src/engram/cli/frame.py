@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -80,11 +79,9 @@ def anchor(
     )
     if not dry_run:
         islands = join_islands(map_path, user(), chosen.of_robot(), chosen.islands, Bars())
-    if as_json:
-        typer.echo(json.dumps({**report.to_dict(), "islands": islands.to_dict()}))
-        return
     undo = undo_text(map_path, *filter(None, (islands.revision, report.revision)))
-    typer.echo("\n".join(filter(None, (report.text(), islands.text(), undo))))
+    text = "\n".join(filter(None, (report.text(), islands.text(), undo)))
+    options.show({**report.to_dict(), "islands": islands.to_dict()}, text, as_json=as_json)
 
 
 def goal(
@@ -126,17 +123,14 @@ def goal(
 
     if action is GoalAction.LIST:
         found = list_goals(map_path)
-        if as_json:
-            print(json.dumps({"goals": found}))
-        for one in [] if as_json else found:
-            typer.echo(_goal_text(one))
+        options.show({"goals": found}, "\n".join(map(_goal_text, found)), as_json=as_json)
         return
     if action is GoalAction.REMOVE:
         if name is None:
             raise InputError("remove needs a name: engram goal remove MAP NAME")
         gone = remove_goal(map_path, name, author=user())
         undo = undo_text(map_path, gone["revision"])
-        typer.echo(json.dumps(gone) if as_json else f"goal {name} is removed\n{undo}")
+        options.show(gone, f"goal {name} is removed\n{undo}", as_json=as_json)
         return
     if name is None or x_m is None or y_m is None:
         raise InputError("add needs a name and a position: engram goal add MAP NAME --x X --y Y")
@@ -148,13 +142,11 @@ def goal(
             "plot shows?",
             err=True,
         )
-    if as_json:
-        print(json.dumps(added))
-        return
-    typer.echo(f"{_goal_text(added)}; revision {added['revision']}")
+    text = [f"{_goal_text(added)}; revision {added['revision']}"]
     if (before := added["replaced"]) is not None:
-        typer.echo(_goal_text({**before, "name": "moved from"}))
-        typer.echo(undo_text(map_path, added["revision"]))
+        text.append(_goal_text({**before, "name": "moved from"}))
+        text.append(undo_text(map_path, added["revision"]))
+    options.show(added, "\n".join(text), as_json=as_json)
 
 
 def _goal_text(one: dict[str, object]) -> str:
@@ -190,8 +182,7 @@ def export(
     from engram.robot.inspecting import export_map
 
     wrote = export_map(map_path, out, at=at)
-    if as_json:
-        typer.echo(json.dumps({"nodes": wrote.nodes, "goals": wrote.goals, "file": str(out)}))
-        return
     goals = f", {counted(wrote.goals, 'goal')}" if wrote.goals else ""
-    typer.echo(f"{out}: {counted(wrote.nodes, 'node')}{goals}")
+    text = f"{out}: {counted(wrote.nodes, 'node')}{goals}"
+    found = {"nodes": wrote.nodes, "goals": wrote.goals, "file": str(out)}
+    options.show(found, text, as_json=as_json)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import getpass
-import json
 import os
 import re
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -43,11 +43,8 @@ def log(
     from engram.maps.history import log_text, map_log
 
     revisions = map_log(map_path, at)
-    if as_json:
-        print(json.dumps(revisions))
-        return
-    for revision in revisions:
-        typer.echo(log_text(revision, oneline=oneline))
+    lines = (log_text(revision, oneline=oneline) for revision in revisions)
+    options.show(revisions, lambda: "\n".join(lines), as_json=as_json)
 
 
 def show(
@@ -73,18 +70,15 @@ def show(
 
     if _is_node(what) and what not in {one["name"] for one in map_tags(map_path)}:
         found = blame_node(map_path, what)
-        typer.echo(json.dumps(found) if as_json else blame_text(found))
+        options.show(found, partial(blame_text, found), as_json=as_json)
         return
     try:
         shown, changed = show_revision(map_path, what)
     except RevisionError as error:
         raise RevisionError(f"{error}; or the beginning of a node's id, 0-9 and a-f") from error
-    if as_json:
-        print(json.dumps({**shown, "difference": changed.to_dict()}))
-        return
-    if shown["number"]:
-        typer.echo(log_text(shown))
-    typer.echo(changed.text())
+    text = [log_text(shown)] if shown["number"] else []
+    found = {**shown, "difference": changed.to_dict()}
+    options.show(found, "\n".join([*text, changed.text()]), as_json=as_json)
 
 
 def _is_node(text: str) -> bool:
@@ -125,7 +119,7 @@ def diff(
         found = town.diff(before, after)
     if picture is not None:
         draw_difference(map_path, found, picture)
-    typer.echo(json.dumps(found.to_dict()) if as_json else found.text())
+    options.show(found, as_json=as_json)
 
 
 def tag(
@@ -156,11 +150,8 @@ def tag(
     if name is None:
         _check_only_listing({"--delete": delete, "--move": move, "--message": bool(message)})
         tags = map_tags(map_path)
-        if as_json:
-            print(json.dumps(tags))
-            return
-        for one in tags:
-            typer.echo(f"{one['name']:20s} revision {one['revision']}  {one['message']}")
+        lines = [f"{one['name']:20s} revision {one['revision']}  {one['message']}" for one in tags]
+        options.show(tags, "\n".join(lines), as_json=as_json)
         return
     who = user()
     with open_map(map_path) as town:
@@ -169,11 +160,9 @@ def tag(
             if delete
             else town.tag(name, revision, author=who, message=message, move=move)
         )
-    if as_json:
-        print(json.dumps(done))
-    else:
-        what = "is no longer" if delete else "is"
-        typer.echo(f"revision {done['revision']} {what} tagged {done['name']}")
+    what = "is no longer" if delete else "is"
+    text = f"revision {done['revision']} {what} tagged {done['name']}"
+    options.show(done, text, as_json=as_json)
 
 
 def _check_only_listing(given: dict[str, bool]) -> None:
@@ -209,11 +198,9 @@ def revert(
     from engram.maps.history import revert_revision
 
     report = revert_revision(map_path, revision, author=user(), message=message, dry_run=dry_run)
-    if as_json:
-        typer.echo(json.dumps(report.to_dict()))
-        return
     made = report.reverted.revision
-    typer.echo(f"{report.text()}\n{undo_text(map_path, made.number) if made else 'dry run'}")
+    end = undo_text(map_path, made.number) if made else "dry run"
+    options.show(report, lambda: f"{report.text()}\n{end}", as_json=as_json)
 
 
 def user() -> str:

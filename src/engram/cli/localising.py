@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from engram.cli.options import ExitStatus, untrusted_if
+from engram.cli.options import ExitStatus, show, untrusted_if
 from engram.errors import InputError
 
 if TYPE_CHECKING:
@@ -109,14 +109,11 @@ def localise_and_print(
         summary["remembered"] = {"state": robot.saving.state, "revision": robot.saving.revision}
     summary |= _records(robot.recorder)
     frames = [result.to_dict() for result in results]
-    if outputs.as_json:
-        print(json.dumps({"summary": summary, "frames": frames}))
-    else:
-        for warning in warnings(summary):
-            typer.echo(warning, err=True)
-        typer.echo(localised_text(summary, frames, outputs.map_path))
-        if outputs.remember:
-            typer.echo(robot.saving.text())
+    for warning in () if outputs.as_json else warnings(summary):
+        typer.echo(warning, err=True)
+    text = [localised_text(summary, frames, outputs.map_path)]
+    text += [robot.saving.text()] if outputs.remember else []
+    show({"summary": summary, "frames": frames}, "\n".join(text), as_json=outputs.as_json)
     if interrupted:
         raise typer.Exit(ExitStatus.INTERRUPTED)
     untrusted_if(fatal)
@@ -162,41 +159,36 @@ def explain_and_print(
     from engram.robot.explaining import explain_frame
 
     found = explain_frame(map_path, sequence, settings, asked)
-    if as_json:
-        print(json.dumps(found.to_dict()))
-    else:
-        _print(found)
+    show(found.to_dict(), partial(_explained_text, found), as_json=as_json)
 
 
-def _print(found: Explanation) -> None:
-    typer.echo(
+def _explained_text(found: Explanation) -> str:
+    lines = [
         f"frame {found.frame}: {found.status.value.replace('_', ' ')}; "
         f"{len(found.candidates)} candidates, "
         f"{sum(one.would_match for one in found.candidates)} would match; "
         f"ordered by {found.ranking}"
-    )
+    ]
     if not found.candidates:
-        typer.echo("nothing to rank: the robot is lost, or the frame is unusable")
-        return
-    if found.rule:
-        typer.echo(f"  order: {found.rule}")
-    for name, meaning in found.meaning.items():
-        typer.echo(f"  {name}: {meaning}")
+        return "\n".join([*lines, "nothing to rank: the robot is lost, or the frame is unusable"])
+    lines += [f"  order: {found.rule}"] if found.rule else []
+    lines += [f"  {name}: {meaning}" for name, meaning in found.meaning.items()]
     names = list(found.candidates[0].terms)
     chance = "chance  " if found.candidates[0].chance is not None else ""
     head = "".join(f"{name:>{_width(name)}}" for name in names)
-    typer.echo(f"   # node     {'drive':34s} {'ahead':>7s}{'aside':>7s}{'yaw':>6s}{'g':>6s}  "
-               f"{chance}{head}  outcome")  # fmt: skip
+    lines.append(f"   # node     {'drive':34s} {'ahead':>7s}{'aside':>7s}{'yaw':>6s}{'g':>6s}  "
+                 f"{chance}{head}  outcome")  # fmt: skip
     for place, one in enumerate(found.candidates[:_LISTED], 1):
         terms = "".join(f"{value:>{_width(name)}.2f}" for name, value in one.terms.items())
         reckoned = "" if one.chance is None else f"{one.chance:6.1%}  "
-        typer.echo(
+        lines.append(
             f"{place:4d} {str(one.node)[:8]} {one.drive:34.34s} {one.along_m:+7.2f}"
             f"{one.across_m:+7.2f}{57.29578 * one.yaw_rad:+6.0f}{one.success_rate:6.2f}  "
             f"{reckoned}{terms}  {_outcome(one)}"
         )
     if len(found.candidates) > _LISTED:
-        typer.echo(f"     and {len(found.candidates) - _LISTED} more; --json lists all")
+        lines.append(f"     and {len(found.candidates) - _LISTED} more; --json lists all")
+    return "\n".join(lines)
 
 
 def _outcome(one: ExplainedCandidate) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -161,25 +162,16 @@ def check(
 
     if geometry or repair:
         looked = _check_geometry(map_path, pictures, settings, commits=repair and yes)
-        if as_json:
-            typer.echo(json.dumps(looked.to_dict()))
-        else:
-            undo = undo_text(map_path, *filter(None, [looked.revision]))
-            typer.echo("\n".join(filter(None, (looked.text(), undo))))
+        undo = undo_text(map_path, *filter(None, [looked.revision]))
+        text = "\n".join(filter(None, (looked.text(), undo)))
+        options.show(looked, text, as_json=as_json)
         if looked.findings.wrong and looked.revision is None:
             raise typer.Exit(1)
         return
     sealed = seal_map(map_path) if seal else []
     report = check_map(map_path, clean=clean)
-    if as_json:
-        print(json.dumps({**report, "sealed": sealed} if seal else report))
-    else:
-        for one in sealed:
-            typer.echo(f"sealed session {one['session']}: {counted(one['nodes'], 'node')}, "
-                       f"revision {one['revision']}")  # fmt: skip
-        if seal and not sealed:
-            typer.echo("no session was interrupted")
-        _print_check(report)
+    found = {**report, "sealed": sealed} if seal else report
+    options.show(found, partial(_checked_text, report, sealed if seal else None), as_json=as_json)
     if report["problems"]:
         raise typer.Exit(1)
 
@@ -203,19 +195,26 @@ def _check_geometry(
     )
 
 
-def _print_check(report: dict[str, Any]) -> None:
-    for problem in report["problems"]:
-        typer.echo(f"{problem['table']} {problem['record']}: {problem['fact']}")
-    for session in report["interrupted"]:
-        typer.echo(
-            f"session {session} was interrupted: map its drive again to resume it, or commit "
-            "what it saved with --seal"
-        )
-    typer.echo(
+def _checked_text(report: dict[str, Any], sealed: list[dict[str, Any]] | None) -> str:
+    """What `check` found; and what it sealed, None if that was not requested."""
+    lines = [
+        f"sealed session {one['session']}: {counted(one['nodes'], 'node')}, "
+        f"revision {one['revision']}"
+        for one in sealed or ()
+    ]
+    lines += ["no session was interrupted"] if sealed == [] else []
+    lines += [f"{one['table']} {one['record']}: {one['fact']}" for one in report["problems"]]
+    lines += [
+        f"session {session} was interrupted: map its drive again to resume it, or commit "
+        "what it saved with --seal"
+        for session in report["interrupted"]
+    ]
+    lines.append(
         f"{counted(len(report['problems']), 'problem')} in {counted(report['rows'], 'row')} and "
         f"{counted(report['blobs'], 'blob')}; {counted(report['abandoned_rows'], 'abandoned row')}"
         f", {report['removed_rows']} removed"
     )
+    return "\n".join(lines)
 
 
 def upgrade(map_path: options.MapPath, *, as_json: options.Json = False) -> None:
@@ -232,15 +231,13 @@ def upgrade(map_path: options.MapPath, *, as_json: options.Json = False) -> None
     from engram.maps.upgrading import upgrade_map
 
     done = upgrade_map(map_path)
-    if as_json:
-        print(json.dumps(asdict(done)))
-    elif done.before == done.after:
-        typer.echo(f"{map_path} is of format {done.after} already")
-    else:
-        typer.echo(
-            f"{map_path}: format {done.before} → {done.after}, "
-            f"{counted(done.revisions, 'revision')}, {counted(done.rows, 'row')} compared"
-        )
+    text = (
+        f"{map_path}: format {done.before} → {done.after}, "
+        f"{counted(done.revisions, 'revision')}, {counted(done.rows, 'row')} compared"
+    )
+    if done.before == done.after:
+        text = f"{map_path} is of format {done.after} already"
+    options.show(asdict(done), text, as_json=as_json)
 
 
 def amend(
@@ -291,13 +288,11 @@ def amend(
     if not changes:
         raise InputError("nothing to correct: give --robot, --recorded-at or --zone")
     done = amend_session(map_path, session, changes, author=user())
-    if as_json:
-        print(json.dumps(done))
-    else:
-        typer.echo(
-            f"session {done['session']}: robot {done['robot']}, start {done['start']}, "
-            f"zone {done['zone'] or 'unknown'}; revision {done['revision']}"
-        )
+    text = (
+        f"session {done['session']}: robot {done['robot']}, start {done['start']}, "
+        f"zone {done['zone'] or 'unknown'}; revision {done['revision']}"
+    )
+    options.show(done, text, as_json=as_json)
 
 
 def vocabulary(
@@ -350,10 +345,7 @@ def vocabulary(
         report = train_map_vocabulary(
             map_path, sources or [], config, author=user(), monitor=Bars()
         )
-    if as_json:
-        print(json.dumps(report.to_dict()))
-    else:
-        typer.echo(report.text())
+    options.show(report, as_json=as_json)
 
 
 def _plain(value: object) -> str:

@@ -6,12 +6,13 @@ import copy
 import dataclasses
 import functools
 import inspect
+import json
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
 import typer
 from msgspec import Meta
@@ -380,6 +381,35 @@ def _view(*, rare: bool = False) -> Any:
 View: TypeAlias = Annotated[Path | None, _view()]
 RareView: TypeAlias = Annotated[Path | None, _view(rare=True)]
 Viewed: TypeAlias = Annotated[Path, _view()]
+
+
+@runtime_checkable
+class Report(Protocol):
+    """What a verb found or did."""
+
+    def to_dict(self) -> Mapping[str, Any]:
+        """What ``--json`` prints."""
+        ...
+
+    def text(self) -> str:
+        """What people read."""
+        ...
+
+
+def show(found: Any, text: str | Callable[[], str] | None = None, *, as_json: bool) -> None:
+    """Prints a result.
+
+    Args:
+        found: a `Report`, or plain values for ``--json``.
+        text: what people read, or what makes it; None for the report's own.
+        as_json: whether machines read it.
+    """
+    if as_json:
+        print(json.dumps(found.to_dict() if isinstance(found, Report) else found))
+        return
+    words = found.text() if text is None else text() if callable(text) else text
+    if words:
+        typer.echo(words)
 
 
 class ExitStatus(IntEnum):

@@ -215,6 +215,14 @@ def shown_settings(settings: AllSettings, *, every: bool) -> list[Setting]:
     return [one for one in every_setting(settings) if every or one.public or one.changed]
 
 
+def listed_settings(settings: AllSettings, *, every: bool) -> str:
+    """The settings as people read them, one a line."""
+    return "\n".join(
+        f"{one.key} = {json.dumps(one.value)}" + (f"  # {words}" if (words := one.comment) else "")
+        for one in shown_settings(settings, every=every)
+    )
+
+
 def settings_toml(settings: AllSettings, *, every: bool = True) -> str:
     """The settings as a file that `--config` reads; a setting that is not given is a comment."""
     lines: list[str] = []

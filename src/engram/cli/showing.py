@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from enum import StrEnum
+from functools import partial
 from typing import Annotated
 
 import typer
@@ -42,20 +42,13 @@ def settings(
       engram settings show --toml > engram.toml
       engram settings show --set mapper.save_every_m=2 --json
     """
-    from engram.cli.settings import settings_toml, shown_settings
+    from engram.cli.settings import listed_settings, settings_toml
     from engram.config import plain
 
     del action  # there is one
     resolved = given.read()
-    if as_json:
-        print(json.dumps(plain(resolved)))
-        return
-    if toml:
-        typer.echo(settings_toml(resolved, every=every))
-        return
-    for one in shown_settings(resolved, every=every):
-        words = one.comment
-        typer.echo(f"{one.key} = {json.dumps(one.value)}" + (f"  # {words}" if words else ""))
+    text = settings_toml if toml else listed_settings
+    options.show(plain(resolved), partial(text, resolved, every=every), as_json=as_json)
 
 
 class FeaturesAction(StrEnum):
@@ -95,23 +88,21 @@ def features(
             {"kind": one.name, "bits": 8 * one.descriptor_bytes, "good_at": one.good_at}
             for one in asked
         ]
-        if as_json:
-            print(json.dumps({"kinds": listed}))
-            return
-        for row in listed:
-            typer.echo(f"{row['kind']:14} {row['bits']} bits  {row['good_at']}".rstrip())
-        typer.echo(
+        lines = [
+            f"{row['kind']:14} {row['bits']} bits  {row['good_at']}".rstrip() for row in listed
+        ]
+        lines.append(
             "a map keeps the kind it is made with: engram map NEW.engram DRIVE --features KIND"
         )
+        options.show({"kinds": listed}, "\n".join(lines), as_json=as_json)
         return
     found = {one.name: check_kind(one) for one in asked}
-    if as_json:
-        rows = {name: [[c.demand, c.met, c.found] for c in part] for name, part in found.items()}
-        print(json.dumps({"checks": rows}))
-    else:
-        for name, part in found.items():
-            for one in part:
-                mark = "ok    " if one.met else "FAILED"
-                typer.echo(f"{name:14} {mark} {one.demand}: {one.found}")
+    rows = {name: [[c.demand, c.met, c.found] for c in part] for name, part in found.items()}
+    lines = [
+        f"{name:14} {'ok    ' if one.met else 'FAILED'} {one.demand}: {one.found}"
+        for name, part in found.items()
+        for one in part
+    ]
+    options.show({"checks": rows}, "\n".join(lines), as_json=as_json)
     if not all(one.met for part in found.values() for one in part):
         raise typer.Exit(1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from pathlib import Path
@@ -201,13 +200,13 @@ def status(folder: Folder, *, as_json: options.Json = False) -> None:
 
 def _print(agent: Agent, *, as_json: bool) -> None:
     found = agent.status()
-    if as_json:
-        print(json.dumps(found))
-        return
-    for name, value in found.items():
-        if name != "outbox":
-            typer.echo(f"{name}: {'-' if value in (None, '') else value}")
-    for row in found["outbox"]:
-        typer.echo(
-            f"outbox {row['id'][:12]} {row['state']} {row['bytes']} bytes {row['error'] or ''}"
-        )
+    lines = [
+        f"{name}: {'-' if value in (None, '') else value}"
+        for name, value in found.items()
+        if name != "outbox"
+    ]
+    lines += [
+        f"outbox {row['id'][:12]} {row['state']} {row['bytes']} bytes {row['error'] or ''}"
+        for row in found["outbox"]
+    ]
+    options.show(found, "\n".join(lines), as_json=as_json)

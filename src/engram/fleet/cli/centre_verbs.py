@@ -171,7 +171,7 @@ def dream(
             row = dreams.ask(centre, map_name, BY)
         else:
             row = jobs.cancel(centre, jobs.get(centre, Dream, cancel), BY)
-    typer.echo(json.dumps(_plain(row)) if as_json else _line(row))
+    options.show(_plain(row), _line(row), as_json=as_json)
 
 
 def jobs(
@@ -201,13 +201,10 @@ def jobs(
             any_job.cancel(centre, any_job.get(centre, HandIn, cancel), BY)
         rows = handins.listed(centre, map_name, limit=1000)
         dreamt = dreams.listed(centre, map_name)
-    if as_json:
-        print(json.dumps({"jobs": list(map(_plain, rows)), "dreams": list(map(_plain, dreamt))}))
-        return
-    for row in reversed(rows):
-        typer.echo(_line(row))
-    for dreamed in reversed(dreamt):
-        typer.echo(f"dream {_line(dreamed)}")
+    lines = [_line(row) for row in reversed(rows)]
+    lines += [f"dream {_line(row)}" for row in reversed(dreamt)]
+    found = {"jobs": list(map(_plain, rows)), "dreams": list(map(_plain, dreamt))}
+    options.show(found, "\n".join(lines), as_json=as_json)
 
 
 def _plain(row: HandIn | Dream) -> dict[str, Any]:

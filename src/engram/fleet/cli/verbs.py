@@ -243,10 +243,7 @@ def download(
             report = take_in(centre, out, asked, at=at, monitor=monitor)
     else:
         report = send(centre, out, asked, at=at, monitor=Bars())
-    if as_json:
-        print(json.dumps(report.to_dict()))
-    else:
-        typer.echo(report.text())
+    options.show(report, as_json=as_json)
 
 
 def build(
@@ -324,10 +321,7 @@ def build(
         judge=_judge(order, validate or [], resolved),
     )
     report = build_map(centre, drives, resolved.of_robot(), asked, monitor=Bars())
-    if as_json:
-        print(json.dumps(report.to_dict()))
-    else:
-        typer.echo(report.text())
+    options.show(report, as_json=as_json)
     if report.interrupted:
         raise typer.Exit(ExitStatus.INTERRUPTED)
 
@@ -436,7 +430,4 @@ def dream(
         report = look_for_better(
             centre, handed or hand_ins_of(centre), validate, given.of_robot(), asked, monitor
         )
-    if as_json:
-        print(json.dumps(report.to_dict()))
-    else:
-        typer.echo(report.text())
+    options.show(report, as_json=as_json)
