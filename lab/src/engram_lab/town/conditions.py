@@ -172,10 +172,11 @@ class Moment:
 
 
 # World 6. Lamps (15 lx below), headlights (30 lx ten metres ahead) and windows (60 cd/m²) as they
-# are beside the sky at dusk: 50 lx from a sun 3° down. Calibrated: reports/town.md.
+# are beside the sky at dusk: 50 lx from a sun 3° down. First values: reports/town.md.
 _AUREOLE_6 = 0.5
 _LAMP_POWER_6, _WINDOW_6, _BEAM_6 = 0.35, 0.02, 0.4
 _NIGHT_SKY_6 = 0.0003
+_MIRRORS_6 = 0.5  # the rest of what wet tarmac throws back is scattered by its grain
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,7 +295,7 @@ class Conditions:
             aureole=_AUREOLE_6,
             lamp_power=_LAMP_POWER_6,
             window=_WINDOW_6,
-            mirrors=1.0,
+            mirrors=_MIRRORS_6,
             beam=_BEAM_6,
         )
 

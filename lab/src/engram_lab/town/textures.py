@@ -89,7 +89,7 @@ class Style:
     relief: float = 2.2
 
 
-# World 6: calibrated by what low sun and night cost on real roads (reports/town.md).
+# World 6: a first value, to be calibrated by what low sun and night cost on real roads.
 _STYLE_6 = Style(paint_contrast=0.45, relief=1.3)
 
 
