@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from engram.errors import MissingExtraError
-from engram.frontend.opencv_contrib import xfeatures2d
+from engram_lab.opencv_contrib import xfeatures2d
 
 
 def _why_not() -> str:

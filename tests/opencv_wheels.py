@@ -70,8 +70,8 @@ def beside(wheel: str, built: list[str], folder: Path) -> int:
 def with_the_extra(built: list[str], folder: Path) -> int:
     python = environment(folder)
     robot, lab = (next(one for one in built if name in one) for name in ("localisation", "lab-"))
-    pip(python, "install", "-c", ROOT / "constraints.txt", f"{robot}[teblid]", lab)
-    return check("engram-localisation[teblid]", python, top="opencv-contrib-python-headless")
+    pip(python, "install", "-c", ROOT / "constraints.txt", robot, f"{lab}[teblid]")
+    return check("engram-lab[teblid]", python, top="opencv-contrib-python-headless")
 
 
 def environment(folder: Path) -> Path:

@@ -12,8 +12,10 @@ from typer.testing import CliRunner
 from engram import plugins
 from engram.cli import app as verbs
 from engram.cli.app import app
-from engram.errors import IncompatibleError
-from engram.frontend.features import feature_kind
+from engram.errors import EngramError, IncompatibleError
+from engram.frontend.features import FEATURES, feature_kind
+from engram.localiser.relocalisation import relocaliser_named
+from engram.places.recognisers import recogniser_named
 from engram.ranking.policies import policy_named, policy_names
 from engram.sequences.opening import layout_named, layout_names, open_drive
 
@@ -68,6 +70,7 @@ LOADS = {
     "engram.policies": ("ranking policy", policy_named),
     "engram.readers": ("reader of drives", layout_named),
     "engram.features": ("kind of features", feature_kind),
+    "engram.recognisers": ("place recogniser", recogniser_named),
     "engram.verbs": ("verb", verbs._PLUGINS.load),
 }
 
@@ -115,6 +118,25 @@ def test_a_class_that_is_no_policy_is_refused(added, named: str, reason: str) ->
     assert "one" in policy_names()
     with pytest.raises(IncompatibleError, match=reason):
         policy_named("one")
+
+
+@pytest.mark.parametrize(
+    ("find", "name", "package"),
+    [
+        (policy_named, "path-near", "engram-lab"),
+        (feature_kind, "teblid", "engram-lab[teblid]"),
+        (relocaliser_named, "bag-of-words", "engram-lab"),
+    ],
+)
+def test_what_the_laboratory_adds_is_named_with_its_package(
+    added, monkeypatch, find, name: str, package: str
+) -> None:
+    added("engram.verbs")
+    monkeypatch.delitem(FEATURES, name, raising=False)
+    with pytest.raises(EngramError) as caught:
+        find(name)
+    assert f"'{name}'" in str(caught.value)
+    assert f", which comes with {package}; known: " in str(caught.value)
 
 
 def test_names_of_engram_are_its_own(added) -> None:

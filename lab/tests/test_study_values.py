@@ -16,7 +16,7 @@ from engram.fleet.merge.gate import what_is_worse
 from engram.graph.basin import BASIN_LEVEL, MatchBasin
 from engram.graph.model import SessionId, session_id
 from engram.measures import Drive
-from engram.ranking.policies import POLICIES
+from engram.ranking.policies import POLICIES, policy_named
 from engram.robot.settings import RobotOptions, Settings
 from engram.sequences.opening import open_drive
 from engram.testing.contracts import make_context
@@ -37,7 +37,7 @@ def test_path_near_ranks_by_paths_only_where_six_in_ten_would_match():
     )  # fmt: skip
     assert BASIN_LEVEL == 0.6
     assert POLICIES["path"]().rank(context).tolist() == [1, 0]
-    assert POLICIES["path-near"]().rank(context).tolist() == [0, 1]
+    assert policy_named("path-near").rank(context).tolist() == [0, 1]
 
 
 def test_maps_are_compared_up_to_twenty_metres():

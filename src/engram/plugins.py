@@ -1,7 +1,8 @@
 """What other installed packages add to Engram, by entry points.
 
-A package names a ranking policy, a reader of drives, a kind of features or a verb in its
-`pyproject.toml`. Whatever comes in is checked where it is loaded. `examples/` has one of each.
+A package names a ranking policy, a place recogniser, a reader of drives, a kind of features or a
+verb in its `pyproject.toml`. Whatever comes in is checked where it is loaded; `examples/` shows
+how.
 """
 
 from __future__ import annotations
@@ -15,6 +16,19 @@ from typing import Any, Generic, TypeVar
 from engram.errors import ConfigError, EngramError, IncompatibleError
 
 T = TypeVar("T")
+
+# What the laboratory adds: a map or a settings file may name it where it is not installed.
+_OF_THE_LABORATORY = {
+    "path-near": "engram-lab",
+    "bag-of-words": "engram-lab",
+    "teblid": "engram-lab[teblid]",
+}
+
+
+def where_from(name: str) -> str:
+    """The package that brings a name, for an error about it; "" if none is known."""
+    package = _OF_THE_LABORATORY.get(name)
+    return "" if package is None else f", which comes with {package}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,7 +34,6 @@ from engram.fleet.merge.gate import check_held_out, what_is_worse
 from engram.fleet.merge.merge_settings import MergeOptions
 from engram.fleet.merge.merging import merge
 from engram.fleet.merge.report import MergeReport, Reason, RunReport, Seed, SegmentReport
-from engram.frontend.frame import TEBLID
 from engram.geometry.se3 import SE3
 from engram.graph.model import Clock, NodeId, Omission, SessionId
 from engram.maps.map import Map
@@ -47,6 +46,7 @@ from engram.robot.mapping import map_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import measure
 from engram.sequences.opening import open_drive
+from engram_lab.teblid import TEBLID
 
 from .robots import frame_log, merged, rewritten, robot_map
 

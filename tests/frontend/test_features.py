@@ -32,7 +32,7 @@ from engram.frontend.features import (
     fitted_matcher,
     known_kinds,
 )
-from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind, Frame, StereoPair
+from engram.frontend.frame import BRIEF, DescriptorKind, Frame, StereoPair
 from engram.frontend.frontend import Frontend, FrontendConfig
 from engram.frontend.matching import MatcherConfig, match_frames
 from engram.geometry.cameras import StereoCamera
@@ -49,6 +49,7 @@ from engram.robot.settings import Settings
 from engram.sequences.framelog.reader import FrameLog
 from engram.sequences.opening import open_drive
 from engram.testing.contracts import check_kind, unmet
+from engram_lab.teblid import TEBLID
 
 CAMERA = StereoCamera(260.0, 260.0, 160.0, 120.0, 0.2, 320, 240)
 BOTH = DescriptorKind("both")
@@ -121,9 +122,9 @@ def test_extraction_gives_descriptors_of_the_width_in_the_table(kind: Descriptor
     found = frame(kind)
     assert found.descriptor == kind
     landmarks = found.landmarks
-    assert landmarks.descriptors.shape == (len(landmarks), FEATURES[kind].descriptor_bytes)
+    assert landmarks.descriptors.shape == (len(landmarks), feature_kind(kind).descriptor_bytes)
     assert landmarks.descriptors.dtype == np.uint8
-    described = FEATURES[kind].describe(pair(0, 0).left, landmarks.pixels, landmarks.octaves)
+    described = feature_kind(kind).describe(pair(0, 0).left, landmarks.pixels, landmarks.octaves)
     # Pixels are stored in steps of 1/64 px: TEBLID, which interpolates, may tell the difference.
     assert np.bitwise_count(described ^ landmarks.descriptors).mean() < 0.1
 
@@ -277,7 +278,7 @@ def test_an_unknown_kind_is_refused_with_the_known_ones() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_meets_the_contract(kind: DescriptorKind) -> None:
-    assert unmet(check_kind(FEATURES[kind])) == []
+    assert unmet(check_kind(feature_kind(kind))) == []
 
 
 def test_a_kind_that_breaks_the_contract_is_found_out() -> None:

@@ -11,10 +11,11 @@ from tests.opencv import needs_contrib
 from engram.config import from_dict, to_dict
 from engram.errors import ConfigError, SequenceError
 from engram.frontend.blobs import pixel_quantum, quantise
-from engram.frontend.features import FEATURES, describe_brief
-from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind, FrameStatus, StereoPair
+from engram.frontend.features import describe_brief, feature_kind
+from engram.frontend.frame import BRIEF, DescriptorKind, FrameStatus, StereoPair
 from engram.frontend.frontend import Frontend, FrontendConfig, make_thumbnail
 from engram.geometry.cameras import StereoCamera
+from engram_lab.teblid import TEBLID
 
 CAMERA = StereoCamera(260.0, 260.0, 160.0, 120.0, 0.2, 320, 240)
 LEFT, RIGHT = shifted_pair(240, 320, 12.25, seed=1, noise=2.0)
@@ -64,7 +65,7 @@ def test_the_fused_descriptors_are_those_of_the_table() -> None:
 
 @pytest.mark.parametrize("kind", [BRIEF, TEBLID])
 def test_describing_nothing_gives_nothing(kind: DescriptorKind) -> None:
-    nothing = FEATURES[kind].describe(LEFT, np.empty((0, 2), np.float32), np.empty(0, np.uint8))
+    nothing = feature_kind(kind).describe(LEFT, np.empty((0, 2), np.float32), np.empty(0, np.uint8))
     assert nothing.shape == (0, 32)
 
 

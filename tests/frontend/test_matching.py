@@ -10,7 +10,6 @@ from tests.scenes import AS_SIMULATED, CAMERA, Scene, normalised_error
 
 from engram import _core
 from engram.errors import ConfigError, IncompatibleError, InputError
-from engram.frontend.frame import TEBLID
 from engram.frontend.matching import (
     MatcherConfig,
     core_settings,
@@ -21,6 +20,7 @@ from engram.frontend.matching import (
 )
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
+from engram_lab.teblid import TEBLID
 
 CONFIG = MatcherConfig()
 REFERENCE_FROM_LIVE = SE3.exp([0.2, -0.05, 1.0, 0.02, 0.1, 0.01])

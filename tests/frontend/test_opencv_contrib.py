@@ -13,10 +13,10 @@ from tests.core.textures import texture
 
 from engram.errors import MissingExtraError
 from engram.frontend.features import FEATURES
-from engram.frontend.frame import TEBLID
 from engram_lab.bench.data import BenchData, synthetic_drive
 from engram_lab.bench.runner import run_bench
 from engram_lab.fits.world import reference_frame
+from engram_lab.teblid import TEBLID
 
 CURE = "pip install --force-reinstall --no-deps opencv-contrib-python-headless"
 

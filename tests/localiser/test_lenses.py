@@ -27,7 +27,7 @@ from engram.graph.neighbourhood import Search
 from engram.localiser.acceptance import Lenses
 from engram.localiser.localisation import Budget, Position
 from engram.maps.map import Map
-from engram.ranking.policies import POLICIES
+from engram.ranking.policies import policy_named
 from engram.robot.localisers import localiser_in
 from engram.robot.settings import Settings
 from engram.testing.contracts import make_node
@@ -86,7 +86,7 @@ class Asked:
     uses_words = False
 
     def __init__(self, name: str) -> None:
-        self.name, self.policy, self.contexts = name, POLICIES[name](), []
+        self.name, self.policy, self.contexts = name, policy_named(name), []
 
     def rank(self, context):
         self.contexts.append(context)

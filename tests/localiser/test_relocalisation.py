@@ -11,16 +11,17 @@ from tests.builders import World, see
 
 from engram.errors import IncompatibleError
 from engram.frontend.features import NET
-from engram.frontend.frame import BRIEF, TEBLID, Frame, Landmarks
+from engram.frontend.frame import BRIEF, Frame, Landmarks
 from engram.localiser.relocalisation import (
-    RELOCALISERS,
     Exhaustive,
     Relocaliser,
+    relocaliser_named,
     spread,
     van_der_corput_order,
 )
 from engram.places.vocabulary import Vocabulary, default_vocabulary
 from engram.places.words import NodeWords
+from engram_lab.teblid import TEBLID
 
 
 @given(st.integers(0, 500))
@@ -105,7 +106,7 @@ LIVE = _Drive(_PLACES_M + 1.5)
 
 @pytest.mark.parametrize("name", ["fabmap", "bag-of-words"])
 def test_a_cold_start_is_proposed_the_right_place_first(name: str) -> None:
-    relocaliser = RELOCALISERS[name](*searched(MAPPED))
+    relocaliser = relocaliser_named(name)(*searched(MAPPED))
     first = []
     for live in LIVE.frames:
         relocaliser.forget()
@@ -118,7 +119,7 @@ def test_a_cold_start_is_proposed_the_right_place_first(name: str) -> None:
 def test_a_cold_start_is_proposed_the_right_place_by_its_signature() -> None:
     mapped, live = (_Drive(places_m, NET) for places_m in (_PLACES_M, _PLACES_M + 1.5))
     words = NodeWords(mapped, lambda: default_vocabulary(NET))
-    relocaliser = RELOCALISERS["signature"](_Nodes(len(_PLACES_M)), words)
+    relocaliser = relocaliser_named("signature")(_Nodes(len(_PLACES_M)), words)
     right = []
     for at, frame in enumerate(live.frames):
         relocaliser.forget()
@@ -128,34 +129,34 @@ def test_a_cold_start_is_proposed_the_right_place_by_its_signature() -> None:
 
 def test_nodes_that_join_the_map_are_proposed_at_once() -> None:
     graph = _Nodes(0)
-    relocaliser = RELOCALISERS["fabmap"](graph, NodeWords(MAPPED, brief))
+    relocaliser = relocaliser_named("fabmap")(graph, NodeWords(MAPPED, brief))
     assert relocaliser.propose(LIVE.frames[7], 1, anywhere) == []
     graph.count = 20
     assert relocaliser.propose(LIVE.frames[7], 1, anywhere)[0] in (7, 8)
 
 
 def test_only_allowed_nodes_are_proposed() -> None:
-    relocaliser = RELOCALISERS["fabmap"](*searched(MAPPED))
+    relocaliser = relocaliser_named("fabmap")(*searched(MAPPED))
     proposed = relocaliser.propose(LIVE.frames[7], 6, lambda index: index % 3 == 0)
     assert len(proposed) == 6
     assert all(index % 3 == 0 for index in proposed)
 
 
 def test_what_failed_gives_way_to_places_further_down_the_list() -> None:
-    relocaliser = RELOCALISERS["fabmap"](*searched(MAPPED))
+    relocaliser = relocaliser_named("fabmap")(*searched(MAPPED))
     proposed = [propose_in_vain(relocaliser) for _ in range(5)]
     assert len({node for nodes in proposed for node in nodes}) == 20
 
 
 def test_many_attempts_a_frame_go_through_the_whole_map_before_any_is_repeated() -> None:
     one_look = SimpleNamespace(frame=lambda node: MAPPED.frames[0])
-    relocaliser = RELOCALISERS["fabmap"](_Nodes(600), NodeWords(one_look, brief))
+    relocaliser = relocaliser_named("fabmap")(_Nodes(600), NodeWords(one_look, brief))
     proposed = [propose_in_vain(relocaliser, 64) for _ in range(9)]
     assert len({node for nodes in proposed for node in nodes}) == 9 * 64
 
 
 def test_after_it_was_found_the_best_places_come_first_again() -> None:
-    relocaliser = RELOCALISERS["fabmap"](*searched(MAPPED))
+    relocaliser = relocaliser_named("fabmap")(*searched(MAPPED))
     first, second = (propose_in_vain(relocaliser) for _ in range(2))
     relocaliser.forget()
     assert relocaliser.propose(LIVE.frames[7], 4, anywhere) == first != second
@@ -173,7 +174,7 @@ def test_one_frame_asks_for_places_apart_from_each_other() -> None:
 
 
 def test_it_tells_how_likely_a_new_place_is() -> None:
-    relocaliser = RELOCALISERS["fabmap"](*searched(MAPPED))
+    relocaliser = relocaliser_named("fabmap")(*searched(MAPPED))
     relocaliser.propose(LIVE.frames[7], 4, anywhere)
     assert relocaliser.new_place is not None
     assert relocaliser.new_place < 0.01
@@ -184,11 +185,11 @@ def test_a_frame_without_landmarks_is_no_error() -> None:
     frame = LIVE.frames[0]
     none = {f.name: getattr(frame.landmarks, f.name)[:0] for f in fields(frame.landmarks)}
     blind = replace(frame, landmarks=Landmarks(**none))
-    assert len(RELOCALISERS["fabmap"](*searched(MAPPED)).propose(blind, 4, anywhere)) == 4
+    assert len(relocaliser_named("fabmap")(*searched(MAPPED)).propose(blind, 4, anywhere)) == 4
 
 
 def test_a_frame_with_another_kind_of_descriptor_is_refused() -> None:
-    relocaliser = RELOCALISERS["fabmap"](*searched(MAPPED))
+    relocaliser = relocaliser_named("fabmap")(*searched(MAPPED))
     other = _Drive(np.array([0.0]), TEBLID).frames[0]
     with pytest.raises(IncompatibleError, match="teblid"):
         relocaliser.propose(other, 4, anywhere)

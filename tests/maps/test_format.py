@@ -12,12 +12,13 @@ import pytest
 from tests.builders import attempts_of
 
 from engram.errors import FormatVersionError, IncompatibleError
-from engram.frontend.frame import BRIEF, TEBLID
+from engram.frontend.frame import BRIEF
 from engram.graph.model import EdgeKind
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.maps.records import SessionState
 from engram.maps.schema import FORMAT_VERSION
+from engram_lab.teblid import TEBLID
 
 from .data.make_map import OMITTED, write_map
 from .maps import begin, node, session

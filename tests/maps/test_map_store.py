@@ -11,7 +11,7 @@ from sqlalchemy import insert
 from tests.builders import attempts_of
 
 from engram.errors import IncompatibleError, InputError, MapError, MapLockedError, RevisionError
-from engram.frontend.frame import BRIEF, TEBLID
+from engram.frontend.frame import BRIEF
 from engram.geometry.cameras import StereoCamera
 from engram.graph.model import EdgeKind, NodeId, PathEntry, PathEntryKind, path_id
 from engram.maps.map import Map
@@ -19,6 +19,7 @@ from engram.maps.map_files import check_file
 from engram.maps.records import SessionState
 from engram.maps.rows import sealed
 from engram.maps.schema import hidden
+from engram_lab.teblid import TEBLID
 
 from .frames import CAMERA, assert_same_landmarks
 from .maps import (

@@ -12,7 +12,7 @@ from sqlalchemy import insert
 from tests.builders import attempts_of
 
 from engram.errors import IncompatibleError, InputError, RevisionError
-from engram.frontend.frame import BRIEF, TEBLID
+from engram.frontend.frame import BRIEF
 from engram.graph.model import NodeId, Omission, PathEntry, PathEntryKind, node_id, path_id
 from engram.maps import writer as writer_module
 from engram.maps.map import Map
@@ -21,6 +21,7 @@ from engram.maps.records import SessionState
 from engram.maps.rows import sealed
 from engram.maps.schema import hidden
 from engram.maps.writer import RevisionWriter
+from engram_lab.teblid import TEBLID
 
 from .copying import begin_bulk, copy_into
 from .frames import CAMERA, FRONTEND, assert_same_landmarks

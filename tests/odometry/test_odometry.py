@@ -7,11 +7,12 @@ import pytest
 from tests.scenes import AS_SIMULATED, CAMERA, Scene, normalised_error
 
 from engram.errors import ConfigError, IncompatibleError
-from engram.frontend.frame import TEBLID, Frame, FrameStatus
+from engram.frontend.frame import Frame, FrameStatus
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram.odometry.odometry import Odometry, OdometryConfig, WindowConfig
 from engram.odometry.step import OdometryStatus
+from engram_lab.teblid import TEBLID
 
 MOTION = SE3.exp([0.03, 0.0, 0.4, 0.0, 0.015, 0.002])
 INTERVAL_NS = 100_000_000

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.places.worlds import THINGS, appearances, look, small_vocabulary
 
 from engram.errors import ConfigError, IncompatibleError, InputError, MapCorruptError
-from engram.frontend.frame import BRIEF, TEBLID
+from engram.frontend.frame import BRIEF
 from engram.places.vocabulary import (
     TrainingConfig,
     decode_vocabulary,
@@ -17,6 +17,7 @@ from engram.places.vocabulary import (
     train_vocabulary,
     vocabulary_hash,
 )
+from engram_lab.teblid import TEBLID
 
 VOCABULARY = small_vocabulary()
 BODY = encode_vocabulary(VOCABULARY)

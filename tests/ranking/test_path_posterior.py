@@ -10,7 +10,7 @@ from tests.reference.path_posterior import posterior, prior_of, theta_row
 
 from engram.graph.model import PathEntry, PathEntryKind
 from engram.graph.paths import PathMemory
-from engram.ranking.policies import PathNearPolicy, PathPolicy
+from engram.ranking.policies import PathPolicy
 from engram.testing.contracts import (
     flat_graph,
     make_context,
@@ -18,6 +18,7 @@ from engram.testing.contracts import (
     neighbourhood_of,
     path_uuid,
 )
+from engram_lab.policies import PathNearPolicy
 
 
 def scores_of(memory: PathMemory, candidates, *evidence, **options) -> np.ndarray:

@@ -9,7 +9,7 @@ from lab.tests.evaluation.campaigns import write_campaign
 from tests.builders import World, drive, localise_simulated, map_simulated
 
 from engram.errors import IncompatibleError, InputError
-from engram.frontend.frame import BRIEF, TEBLID
+from engram.frontend.frame import BRIEF
 from engram.maps.map import Map, open_map
 from engram.monitor import Monitor
 from engram.places.vocabulary import TrainingConfig, default_vocabulary, encode_vocabulary
@@ -19,6 +19,7 @@ from engram.robot.mapping import map_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.vocabularies import train_map_vocabulary, use_vocabulary
 from engram.sequences.opening import open_drive
+from engram_lab.teblid import TEBLID
 
 ROAD = World(length_m=60.0, seed=11)
 VOCABULARY = default_vocabulary(BRIEF)

@@ -15,8 +15,8 @@ from engram.graph.graph import ExperienceGraph
 from engram.graph.model import NodeId
 from engram.maps.map import Map, open_map
 from engram.monitor import QUIET, Monitor
-from engram.places.recognisers import BagOfWords
 from engram.places.words import vocabulary_or_default, words_of
+from engram_lab.bag_of_words import BagOfWords
 
 # Edges are about a metre long; what is within so many of them may well look alike.
 _SURROUNDINGS_EDGES = 15

@@ -5,14 +5,18 @@ They join `engram.ranking` by the entry points "engram.policies", as anybody's p
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import ConfigError
+from engram.graph.basin import BASIN_LEVEL
 from engram.graph.clock import day_of, hour_of_day
 from engram.graph.model import NodeId, path_id
 from engram.places.words import NodeWords
 from engram.ranking.context import RankingContext, Reasons, order_by
+from engram.ranking.policies import PathPolicy, evidence_of
 from engram.ranking.recent import RunAttempts
 
 IN_TURNS = (
@@ -343,10 +347,41 @@ def _began(context: RankingContext, number: int) -> tuple[float, float]:
     return np.nan if hour is None else hour, np.nan if day is None else day
 
 
+class PathNearPolicy:
+    """By the formula of [L15 §V] within the match basin; then the rest by distance.
+
+    The formula ignores distance: over the whole search radius it may prefer a node 8 m away to one
+    of the same experience at 1 m. So it ranks only within the match basin, where g(d) >= 0.6: one
+    reading of the paper's "local metric neighbourhood".
+    """
+
+    name = "path-near"
+
+    def __init__(self, alpha: float = 1.0, gamma: float = 1.0) -> None:
+        self._alpha, self._gamma = alpha, gamma
+
+    def reasons(self, context: RankingContext) -> Reasons:
+        """See `Explains`."""
+        whole = PathPolicy(self._alpha, self._gamma).reasons(context)
+        rule = (
+            f"highest score first for g of {BASIN_LEVEL:g} or more; then the others, nearest first"
+        )
+        return replace(whole, rule=rule)
+
+    def rank(self, context: RankingContext) -> NDArray[np.int64]:
+        """See `RankingPolicy`."""
+        return context.path_memory.order(
+            context.as_seen,
+            evidence_of(context, self._alpha, self._gamma),
+            context.basin,
+            BASIN_LEVEL,
+        )
+
+
 # What the studies run unless told, in the order of their tables.
 STUDIED = (
     "distance",
-    "path-near",
+    PathNearPolicy.name,
     "path",
     RandomPolicy.name,
     OraclePolicy.name,

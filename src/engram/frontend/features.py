@@ -19,6 +19,7 @@ import hashlib
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -27,10 +28,9 @@ from safetensors.numpy import load
 
 from engram import _core
 from engram.errors import ConfigError, IncompatibleError
-from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind, StereoPair
+from engram.frontend.frame import BRIEF, DescriptorKind, StereoPair
 from engram.frontend.matching import MatcherConfig
-from engram.frontend.opencv_contrib import xfeatures2d
-from engram.plugins import PluginGroup, check_is
+from engram.plugins import PluginGroup, check_is, where_from
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -100,11 +100,6 @@ def beside_brief(
 
 NET = DescriptorKind(f"net@{MODEL}")
 
-# OpenCV's TEBLID takes the patch from keypoint size × scale factor; 7 and 5 suit corners without a
-# size best.
-_TEBLID_SCALE_FACTOR = 5.0
-_TEBLID_KEYPOINT_SIZE_PX = 7.0
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keypoints:
@@ -163,6 +158,7 @@ class FeatureKind:
         describe: describes them, if `detect` does not.
         matcher: suitable matcher settings; they replace those left at their defaults.
         good_at: what to choose it for, in a few words.
+        vocabulary: file with the visual words of maps that have none of their own.
     """
 
     name: DescriptorKind
@@ -171,6 +167,7 @@ class FeatureKind:
     describe: Describe
     matcher: MatcherConfig = field(default_factory=MatcherConfig)
     good_at: str = ""
+    vocabulary: Path | None = None
 
     def __post_init__(self) -> None:
         if not (0 < self.descriptor_bytes <= 2048 and self.descriptor_bytes % 8 == 0):
@@ -236,29 +233,6 @@ def describe_brief(
     return descriptors
 
 
-def describe_teblid(
-    image: NDArray[np.uint8], pixels: NDArray[np.float32], octaves: NDArray[np.uint8]
-) -> NDArray[np.uint8]:
-    """TEBLID-256, upright, by OpenCV: descriptors (N, 32) uint8. For arguments see `Describe`.
-
-    Source: Suárez et al., Revisiting Binary Local Image Description for Resource Limited Devices,
-    RA-L 2021.
-    """
-    import cv2
-
-    if not len(pixels):
-        return np.empty((0, 32), dtype=np.uint8)
-    extra = xfeatures2d("the feature kind teblid")
-    engine = extra.TEBLID_create(_TEBLID_SCALE_FACTOR, extra.TEBLID_SIZE_256_BITS)
-    keypoints = [
-        cv2.KeyPoint(float(u), float(v), _TEBLID_KEYPOINT_SIZE_PX * 2 ** int(octave), 0)
-        for (u, v), octave in zip(pixels, octaves, strict=True)
-    ]
-    kept, descriptors = engine.compute(image, keypoints)
-    assert len(kept) == len(keypoints), "TEBLID keeps all points inside the image"
-    return np.asarray(descriptors, dtype=np.uint8)
-
-
 def detect_corners_with_net(pair: StereoPair, config: FrontendConfig, landmarks: int) -> Keypoints:
     """`detect_corners` and `describe_net`."""
     corners = detect_corners_with_brief(pair, config, landmarks)
@@ -284,13 +258,6 @@ FEATURES: dict[DescriptorKind, FeatureKind] = {
             detect_corners_with_brief,
             describe_brief,
             good_at="the same light, small rooms; cheapest",
-        ),
-        FeatureKind(
-            TEBLID,
-            32,
-            detect_corners,
-            describe_teblid,
-            good_at="much as brief; needs OpenCV's contrib modules",
         ),
         FeatureKind(
             NET,
@@ -324,7 +291,7 @@ def feature_kind(name: str) -> FeatureKind:
         )
     names = sorted({*map(plain_name, FEATURES), *added})
     raise IncompatibleError(
-        f"descriptors of kind {name!r} are unknown; known: {', '.join(names)}; "
+        f"descriptors of kind {name!r} are unknown{where_from(plain)}; known: {', '.join(names)}; "
         "install the package that adds them"
     )
 

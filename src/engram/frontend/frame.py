@@ -15,7 +15,6 @@ from engram.geometry.cameras import StereoCamera
 DescriptorKind = NewType("DescriptorKind", str)
 
 BRIEF = DescriptorKind("brief")
-TEBLID = DescriptorKind("teblid")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,12 +27,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram import _core
+from engram.errors import ConfigError
 from engram.frontend.frame import Frame
 from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph, HalfEdges
-from engram.places.recognisers import RECOGNISERS, PlaceRecogniser
+from engram.places.recognisers import (
+    RECOGNISERS,
+    PlaceRecogniser,
+    recogniser_named,
+    recogniser_names,
+)
 from engram.places.vocabulary import Vocabulary
 from engram.places.words import NodeWords, PlaceBook
+from engram.plugins import where_from
 
 Array = NDArray[np.float64]
 
@@ -160,7 +167,7 @@ class Relocaliser(Protocol):
 
     @property
     def name(self) -> str:
-        """Its key in `RELOCALISERS`."""
+        """One of `relocaliser_names()`."""
         ...
 
     @property
@@ -242,7 +249,7 @@ class ByAppearance:
 
     Args:
         graph: the experience graph; may grow.
-        name: key in `RELOCALISERS`.
+        name: one of `relocaliser_names()`.
     """
 
     def __init__(
@@ -384,10 +391,33 @@ def van_der_corput_order(count: int) -> list[int]:
     return [number for number in reversed_numbers if number < count]
 
 
-RELOCALISERS: dict[str, Callable[[ExperienceGraph, NodeWords], Relocaliser]] = {
-    Exhaustive.name: Exhaustive,
-    **{
-        name: partial(ByAppearance, name=name, recogniser=recogniser)
-        for name, recogniser in RECOGNISERS.items()
-    },
-}
+def relocaliser_names() -> list[str]:
+    """Every way to find a lost robot."""
+    return [Exhaustive.name, *recogniser_names()]
+
+
+def relocaliser_named(name: str) -> Callable[[ExperienceGraph, NodeWords], Relocaliser]:
+    """What makes the relocaliser of that name of a map's nodes and their words.
+
+    Raises:
+        ConfigError: the name is unknown.
+        IncompatibleError: another package adds it, and it cannot be used.
+    """
+    check_relocaliser(name)
+    if name == Exhaustive.name:
+        return Exhaustive
+    return partial(ByAppearance, name=name, recogniser=recogniser_named(name))
+
+
+def check_relocaliser(name: str) -> None:
+    """Refuses an unknown relocaliser.
+
+    Raises:
+        ConfigError: the name is unknown.
+    """
+    if name == Exhaustive.name or name in RECOGNISERS:
+        return  # without a look at what is installed
+    if name not in (known := relocaliser_names()):
+        raise ConfigError(
+            f"relocaliser {name!r} is unknown{where_from(name)}; known: {', '.join(known)}, none"
+        )

@@ -297,7 +297,7 @@ class Map:
                 `engram.ranking.POLICIES`.
             lanes: attempts in parallel (Np), >= 1.
             rounds: rounds of attempts per frame (Nr), >= 1; up to 32 when lost.
-            relocaliser: how a lost robot is found: "fabmap", "signature" (net), "bag-of-words",
+            relocaliser: how a lost robot is found: "fabmap", "signature" (net),
                 "exhaustive"; None for none.
             threads: most threads of the robot, the caller's included; None: `lanes` + 2 to 4.
 

@@ -1,10 +1,6 @@
-"""Place recognisers: FAB-MAP 2.0, bag of words, and signatures of whole images.
+"""Place recognisers: FAB-MAP 2.0, and signatures of whole images.
 
-Bag of words, the baseline: similarity of two images' words, weighted by their rarity. A word counts
-once however often an image shows it: repeated structure would dominate otherwise (Jégou et al., On
-the burstiness of visual elements, CVPR 2009).
-
-Source: Sivic & Zisserman, Video Google, ICCV 2003.
+Another package adds one by an entry point of the group `engram.recognisers` that names its class.
 
 Signatures: one binary descriptor of a whole image, pooled from those of its landmarks. Each
 landmark belongs to the nearest of a few centres and to a column of the image. For every centre and
@@ -47,6 +43,7 @@ from engram.places.vocabulary import (
     Vocabulary,
     WordStatistics,
 )
+from engram.plugins import PluginGroup
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,52 +123,6 @@ class ReadsFrames(Protocol):
     def signature(self, frame: Frame) -> NDArray[np.int32]:
         """(n,) int32: what `add`, `compare` and `recognise` take for an image instead of words."""
         ...
-
-
-class BagOfWords:
-    """A `PlaceRecogniser` by the cosine of tf-idf vectors. It does not detect new places.
-
-    Args:
-        vocabulary: its training images give the rarity of each word.
-    """
-
-    name = "bag-of-words"
-
-    def __init__(self, vocabulary: Vocabulary) -> None:
-        self._idf = inverse_frequencies(vocabulary.statistics)
-        self._index = _core.PlaceIndex(len(vocabulary))
-        self._norms = np.zeros(16)
-
-    def __len__(self) -> int:
-        return len(self._index)
-
-    def add(self, words: NDArray[np.int32]) -> int:
-        """See `PlaceRecogniser`."""
-        number = self._index.add(words)
-        if number == len(self._norms):
-            self._norms = np.concatenate([self._norms, np.zeros(max(16, number // 8))])
-        self._norms[number] = self._norm(words)
-        return number
-
-    def similarities(self, words: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(P,) float64: cosine, 0…1, of an image with the words (n,) int32 and each place."""
-        sums = np.zeros(len(self))
-        self._index.add_weights(words, self._idf[words] ** 2, sums)
-        norms = self._norms[: len(self)] * self._norm(words)
-        return np.divide(sums, norms, out=np.zeros_like(sums), where=norms > 0)
-
-    def compare(self, words: NDArray[np.int32]) -> Comparison:
-        """See `PlaceRecogniser`."""
-        return Comparison(self.similarities(words), None)
-
-    def recognise(self, words: NDArray[np.int32], count: int) -> Recognition:
-        """See `PlaceRecogniser`."""
-        cosines = self.similarities(words)
-        best = _core.best_scores(cosines, count)
-        return Recognition(best, cosines[best], None)
-
-    def _norm(self, words: NDArray[np.int32]) -> float:
-        return float(np.linalg.norm(self._idf[words]))
 
 
 def inverse_frequencies(statistics: WordStatistics) -> NDArray[np.float64]:
@@ -628,6 +579,29 @@ class _Likelihoods:
 
 RECOGNISERS: dict[str, Callable[[Vocabulary], PlaceRecogniser]] = {
     FabMap.name: FabMap,
-    BagOfWords.name: BagOfWords,
     Signatures.name: Signatures,
 }
+
+
+def recogniser_names() -> list[str]:
+    """All recognisers: Engram's own, then those of other packages."""
+    return [*RECOGNISERS, *(name for name in _PLUGINS.names() if name not in RECOGNISERS)]
+
+
+def recogniser_named(name: str) -> Callable[[Vocabulary], PlaceRecogniser]:
+    """What makes the recogniser of that name of a vocabulary.
+
+    Raises:
+        IncompatibleError: another package adds it, and it cannot be used.
+    """
+    return RECOGNISERS[name] if name in RECOGNISERS else _PLUGINS.load(name)
+
+
+def _checked(name: str, found: Any) -> Callable[[Vocabulary], PlaceRecogniser]:
+    if not callable(found) or getattr(found, "name", None) != name:
+        raise ConfigError(f"{found!r} must be a class whose name is {name!r}")
+    make: Callable[[Vocabulary], PlaceRecogniser] = found
+    return make
+
+
+_PLUGINS = PluginGroup("engram.recognisers", "place recogniser", _checked)

@@ -414,12 +414,14 @@ def decode_vocabulary(body: bytes) -> Vocabulary:
 def default_vocabulary(descriptor: DescriptorKind) -> Vocabulary:
     """The vocabulary of a map that has none of its own.
 
-    For the kinds of this package a small one, trained on simulated drives; for others
+    For the kinds of this package a small one, trained on simulated drives; for others theirs, or
     `one_word_vocabulary`.
     """
     file = resources.files("engram.places") / "data" / f"{plain_name(descriptor)}.safetensors"
     if file.is_file():
         return decode_vocabulary(file.read_bytes())
+    if (added := feature_kind(descriptor).vocabulary) is not None:
+        return decode_vocabulary(added.read_bytes())
     return one_word_vocabulary(descriptor)
 
 

@@ -1,10 +1,9 @@
-"""The table of ranking policies, with Γ(path), Γ(path-near) and Γ(distance) (method §4)."""
+"""The table of ranking policies, with Γ(path) and Γ(distance) (method §4)."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +11,7 @@ from numpy.typing import NDArray
 
 from engram import _core
 from engram.errors import ConfigError
-from engram.graph.basin import BASIN_LEVEL
-from engram.plugins import PluginGroup
+from engram.plugins import PluginGroup, where_from
 from engram.ranking.context import (
     RankingContext,
     RankingPolicy,
@@ -91,37 +89,6 @@ def evidence_of(context: RankingContext, alpha: float, gamma: float) -> _core.Pa
     )
 
 
-class PathNearPolicy:
-    """By the formula of [L15 §V] within the match basin; then the rest by distance.
-
-    The formula ignores distance: over the whole search radius it may prefer a node 8 m away to one
-    of the same experience at 1 m. So it ranks only within the match basin, where g(d) >= 0.6: one
-    reading of the paper's "local metric neighbourhood".
-    """
-
-    name = "path-near"
-
-    def __init__(self, alpha: float = 1.0, gamma: float = 1.0) -> None:
-        self._alpha, self._gamma = alpha, gamma
-
-    def reasons(self, context: RankingContext) -> Reasons:
-        """See `Explains`."""
-        whole = PathPolicy(self._alpha, self._gamma).reasons(context)
-        rule = (
-            f"highest score first for g of {BASIN_LEVEL:g} or more; then the others, nearest first"
-        )
-        return replace(whole, rule=rule)
-
-    def rank(self, context: RankingContext) -> NDArray[np.int64]:
-        """See `RankingPolicy`."""
-        return context.path_memory.order(
-            context.as_seen,
-            evidence_of(context, self._alpha, self._gamma),
-            context.basin,
-            BASIN_LEVEL,
-        )
-
-
 class DistancePolicy:
     """By the distance of the node from the position estimate, nearest first."""
 
@@ -139,7 +106,6 @@ class DistancePolicy:
 
 POLICIES: dict[str, Callable[[], RankingPolicy]] = {
     PathPolicy.name: PathPolicy,
-    PathNearPolicy.name: PathNearPolicy,
     RecallPolicy.name: RecallPolicy,
     DistancePolicy.name: DistancePolicy,
 }
@@ -156,7 +122,8 @@ def policy_named(name: str) -> RankingPolicy:
         return _made(name, POLICIES[name])
     if name in _PLUGINS.names():
         return _PLUGINS.load(name)
-    raise ConfigError(f"no ranking policy '{name}'; known: {', '.join(sorted(policy_names()))}")
+    known = ", ".join(sorted(policy_names()))
+    raise ConfigError(f"no ranking policy '{name}'{where_from(name)}; known: {known}")
 
 
 def _made(name: str, make: Any) -> RankingPolicy:

@@ -307,7 +307,7 @@ def relocaliser_with_fixes(
         opened: the map; fixes propose nothing in one that is not anchored to the earth.
         sequence: the drive; only bags hold fixes.
         settings: `localiser.fix_sigmas` says how far from a fix nodes are proposed.
-        name: key of `RELOCALISERS`; None for none.
+        name: one of `relocaliser_names()`; None for none.
         saves: see `LocaliserParts`.
 
     Returns:
@@ -335,7 +335,7 @@ def suggesting(
         opened: the map; fixes propose nothing in one that is not anchored to the earth.
         latest: the newest fix at a time, ns; None without one.
         settings: `localiser.fix_sigmas` says how far from a fix nodes are proposed.
-        name: key of `RELOCALISERS`; None for none.
+        name: one of `relocaliser_names()`; None for none.
         saves: see `LocaliserParts`.
 
     Returns:

@@ -36,7 +36,7 @@ from engram.maps.frame_reader import FrameReader
 from engram.maps.map import Map
 from engram.maps.records import Revision, StoredSession
 from engram.maps.writer import RevisionWriter
-from engram.places.recognisers import RECOGNISERS
+from engram.places.recognisers import recogniser_names
 from engram.places.words import NodeWords, words_of
 from engram.ranking.context import RankingPolicy
 from engram.robot.front import Arrived
@@ -374,7 +374,7 @@ def commit_crashed(opened: Map, robot: str, settings: Settings) -> tuple[int, ..
 
 def node_words(opened: Map, settings: Settings, relocaliser: str | None) -> NodeWords | None:
     """Finds the words of saved nodes; first adds those missing from older nodes."""
-    if relocaliser not in RECOGNISERS:
+    if relocaliser not in recogniser_names():
         return None
     words = opened.derived(words_of, settings.frontend.descriptor)
     words.keep_missing([node.id for node in opened.graph.nodes])

@@ -32,7 +32,7 @@ class ExplainOptions:
         frame: number of the frame in the drive, from 0.
         ranking: which nodes to try first: key of `POLICIES`.
         lanes, rounds: the budget of each frame up to and including this one.
-        relocaliser: key of `RELOCALISERS`; None for none.
+        relocaliser: one of `relocaliser_names()`; None for none.
         at: number or tag of the map's revision; None for the newest.
     """
 

@@ -8,7 +8,7 @@ from typing import TypeAlias, TypedDict, Unpack
 
 import numpy as np
 
-from engram.errors import ConfigError, InputError, SequenceError
+from engram.errors import InputError, SequenceError
 from engram.frontend.frame import DescriptorKind
 from engram.geometry.cameras import StereoCamera
 from engram.graph.basin import BasinConfig, MatchBasin
@@ -20,7 +20,7 @@ from engram.graph.paths import Evidence, PathMemory
 from engram.localiser.attempts import Matcher
 from engram.localiser.localisation import Budget
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, LiveDrive, Localiser, MapParts
-from engram.localiser.relocalisation import RELOCALISERS, Relocaliser
+from engram.localiser.relocalisation import Relocaliser, relocaliser_named
 from engram.localiser.settings import LocaliserConfig
 from engram.maps.map import Map
 from engram.places.words import words_of
@@ -38,7 +38,7 @@ class LocaliserParts(TypedDict, total=False):
     Attributes:
         policy: key of `POLICIES`, or a policy.
         budget: attempts per frame; None for 2 lanes × 2 rounds.
-        relocaliser: key of `RELOCALISERS`, or one that several drives share; None for none.
+        relocaliser: one of `relocaliser_names()`, or one that several drives share; None for none.
         saves: whether the session is being mapped: in the whole graph, which grows.
         threads: how many threads the lanes share; None for one each.
         matcher, search: replace the default ones; see `Localiser` and `MapParts`.
@@ -99,17 +99,15 @@ def relocaliser_in(
     """The relocaliser of a map.
 
     Args:
-        name: key of `RELOCALISERS`.
+        name: one of `relocaliser_names()`.
         descriptor: kind of the live frames' descriptors; used while the map is empty.
         graph: the graph of the localiser; None for one of the map by pages.
 
     Raises:
         MapCorruptError: the vocabulary or a node's landmarks are damaged.
     """
-    if name not in RELOCALISERS:
-        raise ConfigError(f"relocaliser {name!r} is unknown; known: {', '.join(RELOCALISERS)}")
     words = opened.derived(words_of, descriptor)
-    return RELOCALISERS[name](opened.read_graph() if graph is None else graph, words)
+    return relocaliser_named(name)(opened.read_graph() if graph is None else graph, words)
 
 
 def drives_of(opened: Map) -> dict[SessionId, Session]:

@@ -76,7 +76,7 @@ class RobotOptions:
         lanes, rounds: the budget of each frame.
         deadline_ms: latest start of an attempt after its frame arrived. With None only the counts
             limit it, so that equal input gives equal results.
-        relocaliser: key of `RELOCALISERS`, for a lost robot; None for none.
+        relocaliser: one of `relocaliser_names()`, for a lost robot; None for none.
         threads: most threads of the robot, its caller's included; None for one per lane and per
             background task. Without a deadline the results are the same with any number.
         author: author of revisions; None for the robot.

@@ -22,7 +22,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
-from engram.frontend.opencv_contrib import xfeatures2d
+from engram_lab.opencv_contrib import xfeatures2d
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]

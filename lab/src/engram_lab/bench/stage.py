@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import numpy as np
 
 from engram.errors import MissingExtraError
-from engram.frontend.opencv_contrib import xfeatures2d
 from engram_lab.bench.data import BenchData
+from engram_lab.opencv_contrib import xfeatures2d
 
 PlainPipeline: TypeAlias = ModuleType
 

@@ -32,11 +32,11 @@ from engram.graph.model import Edge, EdgeKind
 from engram.localiser.acceptance import AcceptanceConfig
 from engram.maps.map import Map
 from engram.maps.map_frame import graph_of
-from engram.places.recognisers import BagOfWords
 from engram.places.words import vocabulary_or_default, words_of
 from engram.repair.finding import RepairConfig, find_wrong_edges, is_measured
 from engram.robot.mapping import map_drive
 from engram.sequences.opening import open_drive
+from engram_lab.bag_of_words import BagOfWords
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.studies.drives import TrueNodes, campaign_logs, drives_of
 from engram_lab.town.campaigns import campaign_named

@@ -3,7 +3,7 @@
     python -m engram_lab.fits.vocabularies FOLDER
     python -m engram_lab.fits.vocabularies FOLDER --kinds net
 
-Trains and writes the package's own data. `brief` and `teblid` learn from drives: what FOLDER does
+Trains and writes the packages' own data. `brief` and `teblid` learn from drives: what FOLDER does
 not hold yet is rendered (2,442 frames, half an hour on a core). `net` learns from the places that
 its network was trained on, seen under every light (2,052 frames); so do its signatures. The towns
 have seeds of their own: no evaluation shares a street with them.
@@ -18,13 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors.numpy import save
 
+import engram.places
+import engram_lab
 from engram import _core
 from engram.frontend.features import NET, NETWORK_BITS, feature_kind, plain_name
-from engram.frontend.frame import BRIEF, TEBLID, DescriptorKind
+from engram.frontend.frame import BRIEF, DescriptorKind
 from engram.frontend.frontend import Frontend, FrontendConfig
-from engram.places.recognisers import SHARE, __file__, members_of
+from engram.places.recognisers import SHARE, members_of
 from engram.places.vocabulary import TrainingConfig, encode_vocabulary, train_vocabulary
 from engram_lab.eyes import training_scene
+from engram_lab.teblid import TEBLID
 from engram_lab.town.campaigns import campaign_named
 from engram_lab.town.session import SimulatedDrive
 
@@ -110,7 +113,6 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="keeps the descriptors of the drives")
     parser.add_argument("--kinds", default="brief,teblid", help="joined by commas")
     asked = parser.parse_args()
-    data = Path(__file__).parent / "data"
     for name in asked.kinds.split(","):
         kind = feature_kind(name).name
         drives = kind in {BRIEF, TEBLID}
@@ -118,6 +120,8 @@ def main() -> None:
         about = TRAINED_ON if drives else TRAINED_ON_PLACES
         vocabulary = train_vocabulary(frames, kind, CONFIG, trained_on=about)
         body = encode_vocabulary(vocabulary)
+        package = engram_lab if kind == TEBLID else engram.places
+        data = Path(*package.__path__) / "data"
         (data / f"{plain_name(kind)}.safetensors").write_bytes(body)
         print(f"{kind}: {len(vocabulary)} words, {len(body)} bytes")
         if kind == NET:

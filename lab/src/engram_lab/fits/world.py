@@ -27,12 +27,12 @@ from engram.cli.screen import Bars
 from engram.config import config_hash
 from engram.errors import SequenceError
 from engram.frontend.frame import StereoPair
-from engram.frontend.opencv_contrib import xfeatures2d
 from engram.geometry.se3 import SE3
 from engram.measures import Drive, route_not_localised
 from engram.monitor import QUIET, Monitor
 from engram.robot.settings import RobotOptions, Settings
 from engram.sequences.opening import open_drive
+from engram_lab.opencv_contrib import xfeatures2d
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.studies.configurations import UNLIMITED, Configuration
 from engram_lab.studies.drives import DriveSet, campaign_logs, drives_of

@@ -176,7 +176,7 @@ def run_in_step(
 
     Args:
         matcher: makes the matches, unguided; None for the localiser's own, guided ones.
-        relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near.
+        relocaliser: one of `relocaliser_names()`; None leaves the lost to what is near.
         cost_so_far: seconds spent in making matches; left out of `step_ms`.
         threads: most threads that a robot's lanes share; None for one each.
     """

@@ -25,7 +25,7 @@ from engram.errors import ConfigError, InputError, MapLockedError, WorkerError, 
 from engram.files import WriterLock, current_holder
 from engram.frontend.frame import DescriptorKind
 from engram.frontend.matching import matcher_hash
-from engram.localiser.relocalisation import RELOCALISERS
+from engram.localiser.relocalisation import check_relocaliser
 from engram.localiser.settings import METHOD_VERSION
 from engram.measures import Drive, Estimator, failure_sums
 from engram.monitor import Monitor, write_whole
@@ -360,7 +360,7 @@ class StudyOptions:
     """Options of every study.
 
     Attributes:
-        relocaliser: key of `RELOCALISERS`; None for none.
+        relocaliser: one of `relocaliser_names()`; None for none.
         only_folds: numbers of the folds that are run; empty for all. What is run of the others
             later joins it.
     """
@@ -371,10 +371,8 @@ class StudyOptions:
     only_folds: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.relocaliser is not None and self.relocaliser not in RELOCALISERS:
-            raise ConfigError(
-                f"relocaliser {self.relocaliser!r} is unknown; known: {', '.join(RELOCALISERS)}"
-            )
+        if self.relocaliser is not None:
+            check_relocaliser(self.relocaliser)
         check_only(self.only_folds, self.folds)
 
 

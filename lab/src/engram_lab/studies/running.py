@@ -65,7 +65,7 @@ def localise_held_out(
 
     Args:
         matcher: makes the matches, unguided; None for the localiser's own, guided ones.
-        relocaliser: key of `RELOCALISERS`; None leaves the lost to what is near.
+        relocaliser: one of `relocaliser_names()`; None leaves the lost to what is near.
         threads: most threads that a robot's lanes share; None for one each.
     """
     nodes, truth = true_nodes(opened, training), drive.truth()

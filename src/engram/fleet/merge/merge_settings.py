@@ -10,9 +10,8 @@ from typing import Annotated
 from msgspec import Meta
 
 from engram.config import PUBLIC, check_bounds
-from engram.errors import ConfigError
 from engram.localiser.localisation import Budget
-from engram.localiser.relocalisation import RELOCALISERS
+from engram.localiser.relocalisation import check_relocaliser
 from engram.ranking.policies import check_for_robot
 from engram.robot.robot import Robot
 from engram.sequences.sequence import LoggedFrame
@@ -60,7 +59,7 @@ class MergeSettings:
     rounds: Annotated[int, Meta(ge=1, description="rounds of attempts for a frame, Nr"), PUBLIC] = 4
     relocaliser: Annotated[
         str,
-        Meta(description="places segments without a known neighbour: key of RELOCALISERS"),
+        Meta(description="places segments without a known neighbour, as drive.relocaliser"),
         PUBLIC,
     ] = "fabmap"
     sure_inliers: Annotated[
@@ -88,18 +87,15 @@ class MergeSettings:
 
     @property
     def relocaliser_name(self) -> str | None:
-        """Key of `RELOCALISERS`; None for none."""
+        """One of `relocaliser_names()`; None for none."""
         return None if self.relocaliser == NO_RELOCALISER else self.relocaliser
 
     def __post_init__(self) -> None:
         check_bounds(self)
         check_for_robot(self.ranking)
         Budget(self.lanes, self.rounds)  # refuses an invalid budget
-        if self.relocaliser not in {NO_RELOCALISER, *RELOCALISERS}:
-            raise ConfigError(
-                f"relocaliser {self.relocaliser!r} is unknown; known: "
-                f"{', '.join(RELOCALISERS)}, {NO_RELOCALISER}"
-            )
+        if self.relocaliser != NO_RELOCALISER:
+            check_relocaliser(self.relocaliser)
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,7 @@ from engram.maps.map import Map
 from engram.maps.map_files import copy_map, publish_map
 from engram.maps.map_frame import moves
 from engram.monitor import QUIET, Monitor, interruptible
-from engram.places.recognisers import RECOGNISERS
+from engram.places.recognisers import recogniser_names
 from engram.places.words import NodeWords, vocabulary_or_default
 from engram.robot.localisers import drives_of
 from engram.robot.settings import RobotOptions, Settings
@@ -114,7 +114,7 @@ def merge_one(
                 monitor.check()
             report.revision = merge.writer.commit(settings.placing).number
         report.moved = moves(places, centre.placements, goals)
-        if options.relocaliser in RECOGNISERS:  # these use the nodes' visual words
+        if options.relocaliser in recogniser_names():  # these use the nodes' visual words
             _keep_words(merge, settings.frontend.descriptor)
     _say_what_hangs_together(merge, before)
     report.content_hash = centre.content_hash()

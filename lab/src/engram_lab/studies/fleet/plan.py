@@ -59,7 +59,7 @@ class ArmRule:
         """The arm under some settings.
 
         Args:
-            relocaliser: key of `RELOCALISERS`, for robots; None for none.
+            relocaliser: one of `relocaliser_names()`, for robots; None for none.
         """
         drive, merging = settings.drive, MergeOptions.of(settings.merge)
         driving = RobotOptions(

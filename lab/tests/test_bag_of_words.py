@@ -3,7 +3,7 @@
 import numpy as np
 from tests.places.worlds import small_vocabulary
 
-from engram.places.recognisers import BagOfWords
+from engram_lab.bag_of_words import BagOfWords
 
 VOCABULARY = small_vocabulary()
 
