@@ -158,6 +158,7 @@ MAP_VERBS = [
     "show MAP 0",
     "tag MAP",
     "tag MAP {wild}",
+    "upgrade MAP",
     "vocabulary show MAP",
     "vocabulary use fleet.engram MAP",
     "localise MAP LOG",
