@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     Moment = Time | float
     Files = Sequence[str | Path]
 else:
-    File, Time, Moment, Files = str, str | int, str | float | int, tuple[str, ...]
+    # Seconds need no decimal point there: 2 is 2.0.
+    File, Time, Moment, Files = str, str | int, str | float, tuple[str, ...]
 
 # Software-triggered pairs stay below it, and it is half of the frame interval at 100 Hz.
 PAIR_TOLERANCE_NS = 5_000_000
