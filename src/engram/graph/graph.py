@@ -249,7 +249,7 @@ class HalfEdges:
 
     @staticmethod
     def between(ends: NDArray[np.int32], poses: NDArray[np.float64], reach_m: float) -> HalfEdges:
-        """Those of edges (E, 2) from a to b with poses (E, 12), of at most `reach_m`."""
+        """Those of at most `reach_m`, of edges (E, 2) with transforms ``a_from_b`` (E, 12)."""
         b_in_a = poses[:, 9:]
         a_in_b = -np.einsum("nij,ni->nj", poses[:, :9].reshape(-1, 3, 3), b_in_a)
         short = np.linalg.norm(b_in_a, axis=1) <= reach_m

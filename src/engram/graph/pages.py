@@ -52,8 +52,8 @@ class GraphPage:
         driven_m: (n,) float64, metres.
         ends: (E, 2) int32, dense indices of the ends of all edges at its nodes, oldest edge first.
         kinds: (E,) uint8, index into `EDGE_KINDS`.
-        poses: (E, 12) float64, ``a_from_b`` as in `EdgeTable`.
-        covariances: (E, 6, 6) float64, as in `EdgeTable`.
+        poses: (E, 12) float64, transforms ``a_from_b`` as in `EdgeTable`.
+        covariances: (E, 6, 6) float64, m and rad, as in `EdgeTable`.
     """
 
     number: int
@@ -125,7 +125,7 @@ class GraphPages(Protocol):
         ...
 
     def edges(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-        """Ends (E, 2) and poses (E, 12) of all edges, as in `GraphPage`."""
+        """Ends (E, 2) and transforms (E, 12) of all edges, as in `GraphPage`."""
         ...
 
 

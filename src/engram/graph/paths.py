@@ -467,7 +467,7 @@ class Evidence:
         nodes: (n,) int32, dense indices, rising.
         driven_m: (n,) float64, metres.
         links: (L, 2) int32, rows of the nodes that an odometry edge of one drive joins.
-        good, bad: (n,) float64, successes and weighted failures.
+        good, bad: (n,) float64, number of successes and sum of the weights of failures.
     """
 
     nodes: NDArray[np.int32]

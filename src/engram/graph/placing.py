@@ -487,7 +487,7 @@ class Surroundings:
 
     Attributes:
         held: (H, 2) int64, dense indices of placed nodes that are connected elsewhere.
-        forward: the sum of the translations of each camera's odometry edges elsewhere, metres.
+        forward: camera → (3,) float64, sum of its odometry translations elsewhere, metres.
         right_m: largest x of a place in the map frame; None if there is none.
     """
 
