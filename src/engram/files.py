@@ -38,8 +38,8 @@ def map_path(location: Path | str) -> Path:
     if isinstance(location, str) and location.startswith("postgresql"):
         # Not shown, as it may hold a password.
         raise InputError(
-            "this is the address of a PostgreSQL database, not a map file; the database of a "
-            "centre is given in the environment: ENGRAM_DATABASE"
+            "this is the address of a PostgreSQL database, not a map file; a centre takes it: "
+            "ENGRAM_DATABASE=ADDRESS engram centre serve FOLDER"
         )
     try:
         str(location).encode()

@@ -18,7 +18,7 @@ from engram.cli import wording
 from engram.cli.app import LABORATORY, SPELLINGS, VERBS, app
 from engram.cli.options import Drive, SettingsGiven
 from engram.cli.settings import AllSettings, every_setting
-from engram.errors import InputError
+from engram.errors import InputError, MissingExtraError, extra
 
 ROOT = Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "engram"
@@ -68,14 +68,28 @@ def texts() -> Iterator[tuple[str, int, str]]:
         for node in nodes:
             if isinstance(node, ast.JoinedStr):
                 passed |= {id(part) for part in node.values}
-                parts = (
-                    part.value if isinstance(part, ast.Constant) else "{}" for part in node.values
-                )
-                yield _place(path), node.lineno, "".join(map(str, parts))
         for node in nodes:
-            text = isinstance(node, ast.Constant) and isinstance(node.value, str)
-            if text and id(node) not in passed:
-                yield _place(path), node.lineno, node.value
+            if isinstance(node, ast.Call) and getattr(node.func, "id", None) == "extra":
+                passed |= {id(part) for part in node.args}
+                yield _place(path), node.lineno, _missing_extra(*map(_text, node.args))
+        for node in nodes:
+            text = _text(node)
+            if text is not None and id(node) not in passed:
+                yield _place(path), node.lineno, text
+
+
+def _text(node: ast.AST) -> str | None:
+    """What a string says, with values as `{}`; None of what is no string."""
+    if isinstance(node, ast.JoinedStr):
+        return "".join(_text(part) or "{}" for part in node.values)
+    return node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) else None
+
+
+def _missing_extra(name: str, need: str) -> str:
+    """What people read if the packages of an extra are missing."""
+    with pytest.raises(MissingExtraError) as raised, extra(name, need):
+        raise ImportError
+    return str(raised.value)
 
 
 def _place(path: Path) -> str:

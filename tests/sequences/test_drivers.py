@@ -603,7 +603,7 @@ class TestFolders:
         path = plain_folder(tmp_path / "m", lambda at, _: f"{at:03d}.png", size=2)
         with pytest.raises(SequenceError, match=r"multiply fx, fy, cx and cy .* by 0\.5") as raised:
             open_drive(path)
-        assert "--skip-bad" not in str(raised.value)
+        assert "drive.skip_bad" not in str(raised.value)
 
     def test_skip_bad_is_no_cure_where_all_are_bad(self, tmp_path) -> None:
         path = plain_folder(tmp_path / "m", lambda at, _: f"{at:03d}.png")
@@ -611,7 +611,7 @@ class TestFolders:
             file.write_text("nothing")
         with pytest.raises(SequenceError, match="no readable image") as raised:
             list(open_drive(path))
-        assert "--skip-bad" not in str(raised.value)
+        assert "drive.skip_bad" not in str(raised.value)
 
     @pytest.mark.parametrize(
         ("stamp", "unit"),

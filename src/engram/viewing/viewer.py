@@ -157,7 +157,9 @@ def viewer_on(view: Path) -> Viewer:
 
 
 def _rerun() -> Any:
-    with extra("view", "the viewer needs Rerun (engram plot and localise --pictures do not)"):
+    with extra(
+        "view", "the viewer needs Rerun (engram plot and engram localise --pictures do not)"
+    ):
         import rerun
     return rerun
 
