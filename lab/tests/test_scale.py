@@ -4,8 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
+from engram.frontend.frame import BRIEF
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
+from engram.places.recognisers import PLACES_PER_BLOCK, FabMap
+from engram.places.vocabulary import default_vocabulary
+from engram.places.words import NodeWords, PlaceBook
 from engram_lab.studies.scale import City, Figures, ask, drive_in, table, write_in
 
 
@@ -25,6 +31,39 @@ def test_a_city_is_a_sound_map_that_localises(tmp_path: Path) -> None:
     assert all(seconds >= 0 for seconds in write_in(path, city).values())
     assert set(ask(path, city)) == {"info (s)", "log (s)", "show NODE (s)"}
     assert path.read_bytes() == before
+
+
+def test_a_lost_robot_finds_the_same_places_by_stored_blocks(tmp_path: Path) -> None:
+    city, path = City(4, length=450), tmp_path / "city.engram"
+    city.write(path)
+    vocabulary = default_vocabulary(BRIEF)
+
+    def places() -> tuple[int, np.ndarray, set[int]]:
+        with Map.open(path) as opened:
+            words = NodeWords.of_map(opened, vocabulary)
+            book = PlaceBook(opened.read_graph(), words, FabMap)
+            book.learn_new_nodes()
+            query = words.of_node(city.node(1, 2, 20).id)
+            assert query is not None
+            stored = opened.place_blocks(words.hash, FabMap(vocabulary).stored_as).count
+            return stored, book.compare(query).evidence, book.unreadable
+
+    blocks, whole, _ = places()
+    assert blocks == 0
+    with Map.open(path, writes=True) as opened:
+        NodeWords.of_map(opened, vocabulary).keep_missing([])
+    blocks, by_blocks, unreadable = places()
+    assert blocks == city.nodes // PLACES_PER_BLOCK == 1
+    assert np.array_equal(whole, by_blocks)
+    assert not unreadable
+    assert check_file(path).problems == ()
+
+    with Map.open(path, writes=True) as opened:
+        opened.revert("2", author="test", message="")
+    blocks, by_blocks, unreadable = places()
+    assert blocks == 1
+    assert np.array_equal(whole[:PLACES_PER_BLOCK], by_blocks[:PLACES_PER_BLOCK])
+    assert unreadable == set(range(2250, 4500))
 
 
 def test_the_table_has_a_column_a_city() -> None:

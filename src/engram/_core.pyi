@@ -4,6 +4,7 @@ Functions of many rows release the GIL, `verified_columns` excepted, which reads
 Those of a single transform or covariance do not: to take it back costs more than they do.
 """
 
+import builtins
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -452,6 +453,19 @@ class PlaceIndex:
     def add_weights(
         self, words: NDArray[np.int32], weights: NDArray[np.float64], sums: NDArray[np.float64]
     ) -> None: ...
+    @property
+    def sealed(self) -> int: ...
+    def block(self, number: int) -> builtins.bytes: ...
+
+PLACES_PER_BLOCK: int
+
+def add_block_weights(
+    body: bytes,
+    words_in_all: int,
+    words: NDArray[np.int32],
+    weights: NDArray[np.float64],
+    sums: NDArray[np.float64],
+) -> None: ...
 
 # --- window_ba
 

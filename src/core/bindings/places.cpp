@@ -14,6 +14,7 @@ namespace {
 
 using engram::Input;
 using engram::PlaceIndex;
+using engram::SealedBlock;
 using engram::WordTree;
 
 using Sums = nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
@@ -80,25 +81,25 @@ auto k_majority(const engram::Descriptors &descriptors, int64_t k, int iteration
                         engram::to_numpy(std::move(assignment), {count}));
 }
 
-void check_words(const PlaceIndex &index, const Input<int32_t, 1> &words, bool rising) {
+void check_words(int64_t most, const Input<int32_t, 1> &words, bool rising) {
   for (size_t i = 0; i < words.shape(0); ++i) {
     const int32_t word = words.data()[i];
-    if (word < 0 || word >= index.words())
+    if (word < 0 || word >= most)
       throw std::invalid_argument("word " + std::to_string(word) + ": the index has words 0 to " +
-                                  std::to_string(index.words() - 1));
+                                  std::to_string(most - 1));
     if (rising && i > 0 && word <= words.data()[i - 1])
       throw std::invalid_argument("the words of a place must rise strictly");
   }
 }
 
 int64_t add_place(PlaceIndex &index, const Input<int32_t, 1> &words) {
-  check_words(index, words, true);
+  check_words(index.words(), words, true);
   return index.add(words.data(), static_cast<int64_t>(words.shape(0)));
 }
 
 void add_weights(const PlaceIndex &index, const Input<int32_t, 1> &words,
                  const Input<double, 1> &weights, Sums sums) {
-  check_words(index, words, false);
+  check_words(index.words(), words, false);
   if (words.shape(0) != weights.shape(0))
     throw std::invalid_argument("add_weights: one weight per word");
   if (static_cast<int64_t>(sums.shape(0)) != index.places())
@@ -106,6 +107,35 @@ void add_weights(const PlaceIndex &index, const Input<int32_t, 1> &words,
   nb::gil_scoped_release unlocked;
   ENGRAM_CALL(add_weights, index, words.data(), weights.data(),
               static_cast<int64_t>(words.shape(0)), sums.data());
+}
+
+nb::bytes block_body(const PlaceIndex &index, int64_t number) {
+  if (number < 0 || number >= index.sealed())
+    throw std::invalid_argument("block " + std::to_string(number) + ": " +
+                                std::to_string(index.sealed()) + " blocks are full");
+  const std::vector<uint8_t> &body = index.body(number);
+  return nb::bytes(body.data(), body.size());
+}
+
+void add_block_weights(nb::bytes body, int64_t words_in_all, const Input<int32_t, 1> &words,
+                       const Input<double, 1> &weights, Sums sums) {
+  check_words(words_in_all, words, false);
+  if (words.shape(0) != weights.shape(0))
+    throw std::invalid_argument("add_block_weights: one weight per word");
+  if (static_cast<int64_t>(sums.shape(0)) != PlaceIndex::block_size)
+    throw std::invalid_argument("add_block_weights: one sum per place of the block");
+  if (!SealedBlock::holds(body.size(), words_in_all))
+    throw std::invalid_argument("a block of places is too short for its words");
+  const SealedBlock block(static_cast<const uint8_t *>(body.data()), body.size(), words_in_all);
+  bool within = false;
+  {
+    nb::gil_scoped_release unlocked;
+    within = ENGRAM_CALL(add_weights, block, words.data(), weights.data(),
+                         static_cast<int64_t>(words.shape(0)), sums.data(),
+                         PlaceIndex::block_size);
+  }
+  if (!within)
+    throw std::invalid_argument("a block of places names places beyond its end");
 }
 
 auto best_scores(const Input<double, 1> &scores, int64_t most) {
@@ -141,5 +171,10 @@ void bind_places(nb::module_ &module) {
       .def_prop_ro("bytes", &PlaceIndex::bytes)
       .def("add", &add_place, "words"_a, "Adds a place with rising words; returns its number.")
       .def("add_weights", &add_weights, "words"_a, "weights"_a, "sums"_a,
-           "sums (P,) += the weights (W,) of those words (W,) that each place shows.");
+           "sums (P,) += the weights (W,) of those words (W,) that each place shows.")
+      .def_prop_ro("sealed", &PlaceIndex::sealed, "Number of full blocks.")
+      .def("block", &block_body, "number"_a, "A full block, in the bytes that maps store.");
+  module.attr("PLACES_PER_BLOCK") = PlaceIndex::block_size;
+  module.def("add_block_weights", &add_block_weights, "body"_a, "words_in_all"_a, "words"_a,
+             "weights"_a, "sums"_a, "As `PlaceIndex.add_weights`, of one full block.");
 }

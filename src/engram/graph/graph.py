@@ -661,6 +661,18 @@ class ExperienceGraph:
         """All edges both ways, between nodes at most `reach_m` apart."""
         return HalfEdges.between(self.edge_ends[:, ::-1], self._a_from_b.rows, reach_m)
 
+    def half_edges_from(self, nodes: NDArray[np.int64], reach_m: float) -> HalfEdges:
+        """As `half_edges`, from some nodes, (S,) int64 dense indices, alone."""
+        self._want(nodes.astype(np.int32))
+        found = [(node, half) for node in nodes.tolist() for half in self._halves(node)]
+        sources, halves = np.array(found, np.int64).reshape(-1, 2).T
+        poses = self._a_from_b.rows[halves // 2]
+        b_in_a = poses[:, 9:]
+        a_in_b = -np.einsum("nij,ni->nj", poses[:, :9].reshape(-1, 3, 3), b_in_a)
+        away = np.where((halves % 2 == 0)[:, None], b_in_a, a_in_b)
+        found_all = HalfEdges(sources.astype(np.int32), self._target.rows[halves], away)
+        return found_all.rows(np.linalg.norm(b_in_a, axis=1) <= reach_m)
+
     @property
     def edge_count(self) -> int:
         """Number of edges: it shows whether `half_edges` would find others than before."""
@@ -762,6 +774,16 @@ class ExperienceGraph:
     def holds(self, index: int) -> bool:
         """Whether a dense index below the length belongs to a node."""
         return 0 <= index < len(self)
+
+    @property
+    def paged(self) -> int:
+        """Number of dense indices that are keys of a map, less one; what follows was added."""
+        return 0
+
+    def unused(self, end: int) -> Iterator[int]:
+        """Dense indices below `end` and `paged` that belong to no node."""
+        del end  # every one belongs to a node
+        return iter(())
 
     def ids(self, first: int) -> Iterator[NodeId | None]:
         """The nodes from a dense index on; None for one that belongs to no node."""

@@ -124,6 +124,10 @@ class GraphPages(Protocol):
         """The nodes from a dense index to the end; None for one that belongs to no node."""
         ...
 
+    def unused(self, end: int) -> Iterator[int]:
+        """Dense indices below `end` that belong to no node."""
+        ...
+
     def edges(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
         """Ends (E, 2) and transforms (E, 12) of all edges, as in `GraphPage`."""
         ...
@@ -279,6 +283,15 @@ class PagedGraph(ExperienceGraph):
             return super().holds(index)
         self._want(np.array([index], np.int32))
         return index in self._loaded[index // PAGE].nodes
+
+    @property
+    def paged(self) -> int:
+        """See `ExperienceGraph`."""
+        return self._end
+
+    def unused(self, end: int) -> Iterator[int]:
+        """See `ExperienceGraph`."""
+        return self._pages.unused(min(end, self._end))
 
     def ids(self, first: int) -> Iterator[NodeId | None]:
         """See `ExperienceGraph`."""

@@ -55,6 +55,8 @@ class BeliefConfig:
         slack_m: standard deviation of the distance between a robot and the node it matches, metres.
         reach_m: longest edge that counts as a step, metres.
         leap: largest deficit of a node against the best one, for places that no edge leads to.
+        most_nodes: nodes of a graph of which all are carried along the edges.
+        most_carried: of a larger graph, so many, the likeliest.
         refuted: cost of a failed attempt to its node.
         refuted_beside: cost of a failed attempt to each node joined to it by an edge.
     """
@@ -63,6 +65,8 @@ class BeliefConfig:
     slack_m: float = 1.0
     reach_m: float = 5.0
     leap: float = 8.0
+    most_nodes: int = 20_000
+    most_carried: int = 200
     refuted: float = 2.0
     refuted_beside: float = 0.5
 
@@ -132,21 +136,28 @@ class PlaceBelief:
 
     def _carry(self) -> None:
         """Moves the belief along the edges, in steps about as long as they are."""
-        steps = self._edges()
         moved_m = math.sqrt(self._moved_m @ self._moved_m)
         count = max(1, round(moved_m / self.config.step_m))
         motion = self._moved_m / count
-        off = ((steps.target_in_source - motion) ** 2).sum(axis=1)
-        cost = off / (2 * self.config.slack_m**2)
         stay = float(motion @ motion) / (2 * self.config.slack_m**2)
         for _ in range(count):
+            steps = self._edges()
+            off = ((steps.target_in_source - motion) ** 2).sum(axis=1)
+            cost = off / (2 * self.config.slack_m**2)
             carried = self._belief - stay
             np.maximum.at(carried, steps.targets, self._belief[steps.sources] - cost)
             self._belief = np.maximum(carried, self._belief.max() - self.config.leap)
         self._moved_m = np.zeros(3)
 
     def _edges(self) -> HalfEdges:
-        """Edges short enough to be steps, between nodes that the belief covers."""
+        """Edges short enough to be steps, between nodes that the belief covers.
+
+        Of a large map only those of the likeliest nodes: its edges are not in memory.
+        """
+        if len(self._belief) > self.config.most_nodes:
+            best = _core.best_scores(self._belief, self.config.most_carried)
+            found = self._graph.half_edges_from(best, self.config.reach_m)
+            return found.rows(found.targets < len(self._belief))
         if self._steps is None or self._of_edges != self._graph.edge_count:
             self._steps = self._graph.half_edges(self.config.reach_m)
             self._of_edges = self._graph.edge_count

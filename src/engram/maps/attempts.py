@@ -229,6 +229,21 @@ def write_words(connection: Connection, rows: list[Row]) -> None:
         connection.execute(upsert(words, ("node",)), rows)
 
 
+def load_words_between(
+    connection: Connection, vocabulary: bytes, first: int, last: int
+) -> dict[int, NDArray[np.int32]]:
+    """Words (n,) of the nodes with keys `first` to `last`, by key, without damaged rows."""
+    query = select(*words.columns).where(
+        words.c.vocabulary == vocabulary, words.c.node.between(first, last)
+    )
+    found = {}
+    for row in connection.execute(query):
+        sound = _sound_words(row)
+        if sound is not None:
+            found[row.node] = sound
+    return found
+
+
 def load_words(connection: Connection, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
     """Words (n,) of each node by the vocabulary of this hash (16 bytes), without damaged rows."""
     query = _WORDS.where(words.c.vocabulary == vocabulary).order_by(words.c.node)

@@ -26,6 +26,7 @@ from engram.graph.model import NodeId, PathEntryKind, SessionId
 from engram.maps.attempts import decode_words, unpack
 from engram.maps.content import verified_hash
 from engram.maps.marks import goal_from_row, removal_from_row
+from engram.maps.place_blocks import problem_of
 from engram.maps.records import CheckReport, Problem
 from engram.maps.rows import (
     Row,
@@ -59,6 +60,7 @@ from engram.maps.schema import (
     omitted_landmarks,
     path_entries,
     paths,
+    place_blocks,
     placements,
     removals,
     revisions,
@@ -84,7 +86,18 @@ _REFERENCES = {
     "b": nodes,
     "path": paths,
 }
-_ORDER = (map_format, revisions, cameras, frontends, *VERSIONED, tags, tag_tally, words, runs)
+_ORDER = (
+    map_format,
+    revisions,
+    cameras,
+    frontends,
+    *VERSIONED,
+    tags,
+    tag_tally,
+    words,
+    place_blocks,
+    runs,
+)
 assert set(_ORDER) == set(metadata.sorted_tables)
 
 # Rounding of rotations that come from chains of products.
@@ -456,6 +469,14 @@ def _check_words(checking: _Checking, row: Row) -> None:
     decode_words(row["body"])
 
 
+def _check_place_block(checking: _Checking, row: Row) -> None:
+    checking.blobs += 1
+    if len(row["vocabulary"]) != 16 or row["block"] < 0:
+        raise MapCorruptError(f"block {row['block']} of a vocabulary that cannot be")
+    if problem := problem_of(row["part"], row["content"]):
+        raise MapCorruptError(problem)
+
+
 def _check_rotation(rotation: np.ndarray[Any, np.dtype[np.float64]]) -> None:
     with np.errstate(over="ignore", invalid="ignore"):  # of numbers that no rotation has
         skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
@@ -486,4 +507,5 @@ _ROW_CHECKS: dict[Table, Callable[[_Checking, Row], None]] = {
     hidden: _check_hidden,
     tags: _check_tag,
     words: _check_words,
+    place_blocks: _check_place_block,
 }

@@ -38,7 +38,13 @@ from engram.graph.paths import Attempts, PathMemory
 from engram.graph.placing import PlacingConfig
 from engram.keywords import keywords
 from engram.maps import marks, reading
-from engram.maps.attempts import load_words, words_of_node, words_row, write_words
+from engram.maps.attempts import (
+    load_words,
+    load_words_between,
+    words_of_node,
+    words_row,
+    write_words,
+)
 from engram.maps.checking import check
 from engram.maps.content import content_hash, record_hashes, verified_hash
 from engram.maps.difference import STRETCH_M, MapDifference, difference
@@ -48,6 +54,7 @@ from engram.maps.laying_out import new_places
 from engram.maps.map_frame import MapFrame, all_places, frame_of, graph_of
 from engram.maps.origins import Origin, origin_of
 from engram.maps.pages import MapPages
+from engram.maps.place_blocks import Parts, StoredBlocks, block_rows, write_block
 from engram.maps.records import (
     CheckReport,
     InterruptedSession,
@@ -64,6 +71,7 @@ from engram.maps.revisions import (
     interrupted_sessions,
     new_revision,
     session_and_revision,
+    settled_nodes,
     stored_session,
 )
 from engram.maps.rows import START, Row, checked_text, sealed, session_from_row, verified
@@ -452,6 +460,28 @@ class Map:
         """The stored words (n,) of a node, as `words`; None without sound ones."""
         return words_of_node(self._database, node, vocabulary)
 
+    def words_between(
+        self, vocabulary: bytes, first: int, last: int
+    ) -> dict[int, NDArray[np.int32]]:
+        """The stored words of nodes by key, as `words`, whether a revision hides them or not."""
+        with self._database.reading() as connection:
+            return load_words_between(connection, vocabulary, first, last)
+
+    def place_blocks(self, vocabulary: bytes, recogniser: str) -> StoredBlocks:
+        """The blocks that it stores for a place recogniser.
+
+        Args:
+            vocabulary: hash (16 bytes) of the vocabulary.
+            recogniser: `StoresBlocks.stored_as`.
+        """
+        return StoredBlocks(self._database, vocabulary, recogniser)
+
+    @property
+    def settled_nodes(self) -> int:
+        """Largest key below which no node can go: those of committed revisions, but for gaps."""
+        with self._database.reading() as connection:
+            return settled_nodes(connection)
+
     def derived(
         self, make: Callable[Concatenate[Self, _P], _T], *args: _P.args, **kwargs: _P.kwargs
     ) -> _T:
@@ -795,6 +825,24 @@ class Map:
             rows.append(words_row(key, vocabulary, shown))
         with self._database.writing() as connection:
             write_words(connection, rows)
+
+    @_writes
+    def put_place_block(
+        self, vocabulary: bytes, recogniser: str, number: int, parts: Parts
+    ) -> None:
+        """Stores a block of places in one transaction; no revision, as `put_words`.
+
+        Args:
+            vocabulary: hash (16 bytes) of the vocabulary.
+            recogniser: `StoresBlocks.stored_as`.
+            number: of the block, all of whose nodes are `settled_nodes`.
+            parts: its content by part, see `engram.maps.place_blocks`.
+
+        Raises:
+            StorageFullError: no space; the map is unchanged.
+        """
+        with self._database.writing() as connection:
+            write_block(connection, block_rows(vocabulary, recogniser, number, parts))
 
     @_writes
     def put_vocabulary(

@@ -37,9 +37,17 @@ from engram.maps.attempts import unpack
 from engram.maps.columns import Columns, read_columns, verified_arrays
 from engram.maps.marks import removed_measurements, without_removed
 from engram.maps.reading import load_cameras, sessions_by_key
-from engram.maps.rows import edge_arrays, member, node_from_bytes, uuid_from_bytes, verified
+from engram.maps.rows import (
+    edge_arrays,
+    from_json,
+    member,
+    node_from_bytes,
+    uuid_from_bytes,
+    verified,
+)
 from engram.maps.schema import attempts, edges, nodes, path_entries, paths, revisions
 from engram.maps.sqlite import SqliteDatabase, reading_rows
+from engram.maps.totals import own_rows
 from engram.maps.view import View, place_in_history
 
 # Dense indices are of 32 bits; what a process adds follows after those of the map.
@@ -114,6 +122,31 @@ class MapPages:
                 if self._visible.has(nodes, key, revision)
             }
             yield from (found.get(index + 1) for index in range(start, end))
+
+    def unused(self, end: int) -> Iterator[int]:
+        """See `GraphPages`; asks for the ranges of revisions, and for keys where they have gaps."""
+        next_key = 1
+        for first, last, whole in sorted(self._ranges()):
+            yield from range(next_key - 1, min(first - 1, end))
+            if not whole:
+                found = zip(range(first - 1, min(last, end)), self.ids(first - 1), strict=False)
+                yield from (index for index, node in found if node is None)
+            next_key = last + 1
+        yield from range(next_key - 1, end)
+        hidden = self._visible.hidden[nodes]
+        yield from (key - 1 for key in hidden if key <= end)
+
+    def _ranges(self) -> Iterator[tuple[int, int, bool]]:
+        """First and last key of the nodes of visible revisions, and whether all keys are used."""
+        query = select(revisions).where(revisions.c.key.in_(self._view.revision_keys()))
+        with self._database.reading() as connection:
+            for row in verified(revisions, connection.execute(query)):
+                if nodes.name in (own := own_rows(row).ranges):
+                    first, last = own[nodes.name]
+                    count = from_json(row["contents"], f"contents of revision {row['number']}").get(
+                        nodes.name
+                    )
+                    yield first, last, last - first + 1 == count
 
     def edges(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
         """See `GraphPages`."""

@@ -203,6 +203,19 @@ def collect_abandoned(connection: Connection) -> int:
     return found
 
 
+def settled_nodes(connection: Connection) -> int:
+    """Largest key of a node below which no row can be collected.
+
+    The keys of an open or abandoned revision may be used again.
+    """
+    last = connection.execute(select(func.max(nodes.c.key))).scalar() or 0
+    query = select(revisions).where(revisions.c.status != str(RevisionStatus.COMMITTED))
+    for row in verified(revisions, connection.execute(query)):
+        first, _ = own_rows(row).ranges.get(nodes.name, (last + 1, 0))
+        last = min(last, first - 1)
+    return last
+
+
 def session_and_revision(
     connection: Connection, session: SessionId, at: int
 ) -> tuple[Row, Row] | None:

@@ -264,6 +264,17 @@ words = _table(
     _bytes("body", "the distinct words that the node shows, rising, little-endian u16"),
 )
 
+# Blocks of 8,192 nodes, by key, of a place recogniser: what a lost robot compares. They follow from
+# `words` and landmarks, and belong to no revision.
+place_blocks = _table(
+    "place_blocks",
+    Column("block", _INT64, primary_key=True, autoincrement=False, info={"note": "0, 1, 2 …"}),
+    Column("vocabulary", LargeBinary(), primary_key=True, info={"note": "its hash"}),
+    Column("recogniser", Text(), primary_key=True, info={"note": "and its model"}),
+    Column("part", Text(), primary_key=True, info={"note": "`numbers`, `unreadable`, `body`"}),
+    _bytes("content"),
+)
+
 # What people set right about sessions: whose record stays. Of one session's rows for the same
 # `what`, the newest counts.
 amendments = _table(

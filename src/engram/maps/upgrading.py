@@ -22,14 +22,22 @@ from engram.maps.content import EMPTY_HASH, Identities, chained
 from engram.maps.map_files import log_problems
 from engram.maps.rows import Row, sealed, to_json, verified
 from engram.maps.runs import Runs, save_runs
-from engram.maps.schema import FORMAT_VERSION, VERSIONED, map_format, metadata, revisions, runs
+from engram.maps.schema import (
+    FORMAT_VERSION,
+    VERSIONED,
+    map_format,
+    metadata,
+    place_blocks,
+    revisions,
+    runs,
+)
 from engram.maps.sqlite import MAP_FILE, keep_log, write_format
 from engram.maps.totals import Own, Totals, count_all, count_on
 from engram.maps.view import LARGEST_KEY, View
 from engram.sqlite import SqliteFile, is_full
 
 _NEW_COLUMNS = ("ranges", "totals", "chain")
-_NEW_TABLES = (runs,)
+_NEW_TABLES = (runs, place_blocks)
 _OLD_NAME = "revisions_6"
 # How long to wait for a process that is just closing the map.
 _PATIENCE_MS = 1000

@@ -25,11 +25,13 @@ with FAB-MAP 2.0, IJRR 30(9), 2011 (here [C11]).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import builtins
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +127,88 @@ class ReadsFrames(Protocol):
         ...
 
 
+# Places of a block that maps store.
+PLACES_PER_BLOCK = _core.PLACES_PER_BLOCK
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceBlock:
+    """`PLACES_PER_BLOCK` successive places of a recogniser, as maps store them.
+
+    Attributes:
+        body: what a query reads.
+        numbers: (k, PLACES_PER_BLOCK) float64, what stays in memory.
+    """
+
+    body: bytes
+    numbers: NDArray[np.float64]
+
+
+# Gives the body of a stored block by its number; None where it is damaged.
+ReadBlock: TypeAlias = Callable[[int], bytes | None]
+
+
+@runtime_checkable
+class StoresBlocks(Protocol):
+    """A `PlaceRecogniser` whose full blocks can lie in a file instead of in memory."""
+
+    @property
+    def stored_as(self) -> str:
+        """Names the content of its blocks; another model has another name."""
+        ...
+
+    @property
+    def rows_of_numbers(self) -> int:
+        """Rows k of `PlaceBlock.numbers`."""
+        ...
+
+    def open_blocks(self, numbers: NDArray[np.float64], read: ReadBlock) -> None:
+        """Begins with stored blocks as its first places; called before any `add`.
+
+        Args:
+            numbers: (k, P) float64, those of all blocks, P a multiple of `PLACES_PER_BLOCK`.
+            read: called by each query.
+        """
+        ...
+
+    def block(self, number: int) -> PlaceBlock:
+        """A full block that was added, not opened."""
+        ...
+
+
+class _Growing:
+    """(k, P) float64: numbers of places in rows, of which there are ever more.
+
+    Args:
+        rows: k.
+    """
+
+    def __init__(self, rows: int) -> None:
+        self._columns = np.zeros((rows, 16))
+        self.count = 0
+
+    @property
+    def nbytes(self) -> int:
+        return self._columns.nbytes
+
+    def __getitem__(self, row: int) -> NDArray[np.float64]:
+        return self._columns[row, : self.count]
+
+    def start(self, numbers: NDArray[np.float64]) -> None:
+        self._columns, self.count = numbers, numbers.shape[1]
+
+    def append(self, numbers: Sequence[float]) -> None:
+        if self.count == self._columns.shape[1]:
+            room = np.zeros((len(self._columns), max(16, self.count // 8)))
+            self._columns = np.concatenate([self._columns, room], axis=1)
+        self._columns[:, self.count] = numbers
+        self.count += 1
+
+    def block(self, number: int) -> NDArray[np.float64]:
+        first = number * PLACES_PER_BLOCK
+        return self._columns[:, first : first + PLACES_PER_BLOCK].copy()
+
+
 def inverse_frequencies(statistics: WordStatistics) -> NDArray[np.float64]:
     """(W,) float64: log inverse document frequency of each word, a weight."""
     return np.asarray(np.log((statistics.images + 1) / (statistics.seen + 0.5)))
@@ -144,6 +228,7 @@ class Signatures:
     """A `PlaceRecogniser` by the bits that signatures have in common. It reports no new places."""
 
     name = "signature"
+    rows_of_numbers = 0
 
     def __init__(self, vocabulary: Vocabulary) -> None:
         self._kind = vocabulary.descriptor
@@ -151,10 +236,26 @@ class Signatures:
         self._centres, self._shares = arrays["centres"], arrays["shares"].astype(np.int64)
         self._bytes = self._centres.shape[1]
         self._places = np.zeros((16, self.bytes_per_place), np.uint8)
-        self._count = 0
+        self._count = self._blocks = 0
+        self._read: ReadBlock = lambda _: None
 
     def __len__(self) -> int:
-        return self._count
+        return self._blocks * PLACES_PER_BLOCK + self._count
+
+    @property
+    def stored_as(self) -> str:
+        """See `StoresBlocks`."""
+        return f"{self.name} {self._kind}"
+
+    def open_blocks(self, numbers: NDArray[np.float64], read: ReadBlock) -> None:
+        """See `StoresBlocks`."""
+        self._blocks, self._read = numbers.shape[1] // PLACES_PER_BLOCK, read
+
+    def block(self, number: int) -> PlaceBlock:
+        """See `StoresBlocks`."""
+        first = (number - self._blocks) * PLACES_PER_BLOCK
+        body = self._places[first : first + PLACES_PER_BLOCK].tobytes()
+        return PlaceBlock(body, np.zeros((0, PLACES_PER_BLOCK)))
 
     @property
     def bytes_per_place(self) -> int:
@@ -195,14 +296,25 @@ class Signatures:
         lacks = (parts == _IMAGE_LACKS).all(1)
         self._places[self._count] = np.where(lacks[:, None], _PLACE_LACKS, parts).ravel()
         self._count += 1
-        return self._count - 1
+        return len(self) - 1
 
     def similarities(self, words: Signature) -> NDArray[np.float64]:
         """(P,) float64: share of bits, 0…1, that an image and each place have in common."""
         own = np.ascontiguousarray(self._parts(words).reshape(1, -1))
-        different = _core.hamming_matrix(own, self._places[: self._count])[0]
-        agreement: NDArray[np.float64] = 1.0 - different / (8.0 * self.bytes_per_place)
+        different = [
+            *(_core.hamming_matrix(own, self._stored(block))[0] for block in range(self._blocks)),
+            _core.hamming_matrix(own, self._places[: self._count])[0],
+        ]
+        agreement: NDArray[np.float64]
+        agreement = 1.0 - np.concatenate(different) / (8.0 * self.bytes_per_place)
         return agreement
+
+    def _stored(self, block: int) -> NDArray[np.uint8]:
+        """(PLACES_PER_BLOCK, bytes) uint8: the places of a stored block."""
+        body = self._read(block)
+        if body is None or len(body) != PLACES_PER_BLOCK * self.bytes_per_place:
+            return np.full((PLACES_PER_BLOCK, self.bytes_per_place), _PLACE_LACKS, np.uint8)
+        return np.frombuffer(body, np.uint8).reshape(PLACES_PER_BLOCK, -1)
 
     def _parts(self, words: Signature) -> NDArray[np.uint8]:
         """A signature's parts (P, B); all marked missing for an image without a signature."""
@@ -404,6 +516,7 @@ class FabMap:
     """
 
     name = "fabmap"
+    rows_of_numbers = 2
 
     def __init__(self, vocabulary: Vocabulary, config: FabMapConfig | None = None) -> None:
         self.config = config or FabMapConfig()
@@ -411,30 +524,48 @@ class FabMap:
             vocabulary.statistics, self.config.detector, naive=self.config.naive_bayes
         )
         self._query = _QueryWeights(model)
-        self._places = _Likelihoods(len(vocabulary), model)
-        self._elsewhere = _Likelihoods(len(vocabulary), model)
+        self._gain_unseen = model.log_p[1, 0] - model.log_p[0, 0]
+        self._places = _Postings(len(vocabulary))
+        # Of an image without words at each place, and of the usual image.
+        self._numbers = _Growing(self.rows_of_numbers)
+        self._elsewhere = _Postings(len(vocabulary))
+        self._elsewhere_base = np.array([self._base(sample) for sample in vocabulary.samples])
         for sample in vocabulary.samples:
             self._elsewhere.add(sample)
         self._usual, self._usual_weights = self._of_samples(vocabulary)
-        self._expected = np.zeros(16)
 
     def __len__(self) -> int:
-        return len(self._places)
+        return self._numbers.count
 
     @property
     def bytes_per_place(self) -> float:
-        """Memory per place, without the vocabulary."""
-        return (self._places.bytes + self._expected.nbytes) / max(len(self), 1)
+        """Memory per place, without the vocabulary and what lies in a file."""
+        return (self._places.bytes + self._numbers.nbytes) / max(len(self), 1)
+
+    @property
+    def stored_as(self) -> str:
+        """See `StoresBlocks`."""
+        return f"{self.name} {hashlib.sha256(repr(self.config).encode()).hexdigest()[:8]}"
+
+    def open_blocks(self, numbers: NDArray[np.float64], read: ReadBlock) -> None:
+        """See `StoresBlocks`."""
+        self._numbers.start(numbers)
+        self._places.open_blocks(numbers.shape[1] // PLACES_PER_BLOCK, read)
+
+    def block(self, number: int) -> PlaceBlock:
+        """See `StoresBlocks`."""
+        return PlaceBlock(self._places.block(number), self._numbers.block(number))
 
     def add(self, words: NDArray[np.int32]) -> int:
         """See `PlaceRecogniser`."""
         number = self._places.add(words)
-        if number == len(self._expected):
-            self._expected = np.concatenate([self._expected, np.zeros(max(16, number // 8))])
-        self._expected[number] = (
-            self._places.base(number) + self._usual + self._usual_weights[words].sum()
-        )
+        base = self._base(words)
+        self._numbers.append((base, base + self._usual + self._usual_weights[words].sum()))
         return number
+
+    def _base(self, words: NDArray[np.int32]) -> float:
+        """Log-likelihood of an image without words at a place that shows these."""
+        return float(self._gain_unseen[words].sum())
 
     def _of_samples(self, vocabulary: Vocabulary) -> tuple[float, NDArray[np.float64]]:
         """Mean constant, and (W,) float64 mean weight of each word, over queries by samples."""
@@ -449,7 +580,8 @@ class FabMap:
 
     def log_likelihoods(self, words: NDArray[np.int32]) -> NDArray[np.float64]:
         """(P,) float64: log p(Z | L) of an image with the words (n,) int32 at each place."""
-        return self._places.of(self._query.weigh(words))
+        query = self._query.weigh(words)
+        return self._places.add_weights(query, self._numbers[0] + query.constant)
 
     def compare(self, words: NDArray[np.int32]) -> Comparison:
         """See `PlaceRecogniser`: the log-likelihood at each place less its mean over the samples.
@@ -463,7 +595,7 @@ class FabMap:
             return Comparison(scores, 1.0)
         evidence = self._evidence(scores, elsewhere)
         return Comparison(
-            scores - self._expected[: len(self)],
+            scores - self._numbers[1],
             float(np.exp(self._prior_elsewhere + elsewhere - evidence)),
         )
 
@@ -491,9 +623,10 @@ class FabMap:
 
     def _judge(self, words: NDArray[np.int32]) -> tuple[NDArray[np.float64], float]:
         """(P,) float64 log-likelihood at each place, and that elsewhere."""
-        weights = self._query.weigh(words)
-        sampled = self._elsewhere.of(weights)
-        return self._places.of(weights), _log_mean(sampled)
+        query = self._query.weigh(words)
+        sampled = self._elsewhere.add_weights(query, self._elsewhere_base + query.constant)
+        here = self._places.add_weights(query, self._numbers[0] + query.constant)
+        return here, _log_mean(sampled)
 
     def _evidence(self, scores: NDArray[np.float64], elsewhere: float) -> float:
         """Log of the sum of prior times likelihood, over all places and elsewhere."""
@@ -547,33 +680,36 @@ class _QueryWeights:
         return _Weighed(constant, touched, self._weight[case, touched])
 
 
-class _Likelihoods:
-    def __init__(self, words: int, model: ObservationModel) -> None:
-        self._index = _core.PlaceIndex(words)
-        self._gain_unseen = model.log_p[1, 0] - model.log_p[0, 0]
-        self._base = np.zeros(16)
+class _Postings:
+    """Which places show a word: full blocks in a file, then those in memory."""
 
-    def __len__(self) -> int:
-        return len(self._index)
+    def __init__(self, words: int) -> None:
+        self._words = words
+        self._index = _core.PlaceIndex(words)
+        self._blocks = 0
+        self._read: ReadBlock = lambda _: None
 
     @property
     def bytes(self) -> int:
-        return self._index.bytes + self._base.nbytes
+        return self._index.bytes
+
+    def open_blocks(self, count: int, read: ReadBlock) -> None:
+        self._blocks, self._read = count, read
+
+    def block(self, number: int) -> builtins.bytes:
+        return self._index.block(number - self._blocks)
 
     def add(self, words: NDArray[np.int32]) -> int:
-        number = self._index.add(words)
-        if number == len(self._base):
-            self._base = np.concatenate([self._base, np.zeros(max(16, number // 8))])
-        self._base[number] = self._gain_unseen[words].sum()
-        return number
+        return self._blocks * PLACES_PER_BLOCK + self._index.add(words)
 
-    def base(self, number: int) -> float:
-        """Log-likelihood of an image without words at a place."""
-        return float(self._base[number])
-
-    def of(self, query: _Weighed) -> NDArray[np.float64]:
-        sums = self._base[: len(self)] + query.constant
-        self._index.add_weights(query.words, query.weights, sums)
+    def add_weights(self, query: _Weighed, sums: NDArray[np.float64]) -> NDArray[np.float64]:
+        """`sums` (P,), to which the weights of the words that each place shows were added."""
+        for number in range(self._blocks):
+            of_block = sums[number * PLACES_PER_BLOCK : (number + 1) * PLACES_PER_BLOCK]
+            body = self._read(number)
+            if body is not None:
+                _core.add_block_weights(body, self._words, query.words, query.weights, of_block)
+        self._index.add_weights(query.words, query.weights, sums[self._blocks * PLACES_PER_BLOCK :])
         return sums
 
 

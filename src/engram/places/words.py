@@ -16,9 +16,17 @@ from engram.graph.graph import ExperienceGraph
 from engram.graph.model import LandmarkSource, NodeId
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
+from engram.maps.place_blocks import PLACES_PER_BLOCK, StoredBlocks, block_parts
 from engram.maps.records import Problem
 from engram.monitor import QUIET, Monitor
-from engram.places.recognisers import Comparison, PlaceRecogniser, ReadsFrames, inverse_frequencies
+from engram.places.recognisers import (
+    Comparison,
+    FabMap,
+    PlaceRecogniser,
+    ReadsFrames,
+    StoresBlocks,
+    inverse_frequencies,
+)
 from engram.places.vocabulary import Vocabulary, decode_vocabulary, default_vocabulary, hash_of
 
 Words = NDArray[np.int32]
@@ -172,7 +180,45 @@ class NodeWords:
                 if found:
                     self._store.put_words(self.hash, found)
                     count += len(found)
+        self._keep_blocks(self._store, monitor)
         return count
+
+    def _keep_blocks(self, store: Map, monitor: Monitor) -> None:
+        """Stores the full blocks of FAB-MAP's places that the map lacks, of nodes that stay."""
+        due = store.settled_nodes // PLACES_PER_BLOCK
+        if not due:
+            return
+        recogniser = FabMap(self.vocabulary)
+        first = store.place_blocks(self.hash, recogniser.stored_as).count
+        with monitor.stage("places", max(due - first, 0)) as stage:
+            for number in range(first, due):
+                at = number * PLACES_PER_BLOCK
+                known = self.of_keys(at + 1, at + PLACES_PER_BLOCK)
+                shown = [known.get(at + 1 + place) for place in range(PLACES_PER_BLOCK)]
+                for words in shown:
+                    recogniser.add(np.zeros(0, np.int32) if words is None else words)
+                unreadable = [place for place, words in enumerate(shown) if words is None]
+                block = recogniser.block(number - first)
+                store.put_place_block(
+                    self.hash,
+                    recogniser.stored_as,
+                    number,
+                    block_parts(block.numbers, block.body, unreadable),
+                )
+                stage.advance()
+
+    def stored_blocks(self, recogniser: StoresBlocks) -> StoredBlocks | None:
+        """The blocks of a recogniser that the map stores for this vocabulary."""
+        if self._store is None:
+            return None
+        return self._store.place_blocks(self.hash, recogniser.stored_as)
+
+    def of_keys(self, first: int, last: int) -> dict[int, Words]:
+        """The stored words (n,) int32 of nodes of the map, by key."""
+        if self._store is None:
+            return {}
+        found = self._store.words_between(self.hash, first, last)
+        return {key: words for key, words in found.items() if self._fit(words)}
 
     def give(self, other: Map, nodes: Sequence[NodeId]) -> None:
         """Stores the words of nodes in another map, whether this one stores them or not.
@@ -229,16 +275,41 @@ class PlaceBook:
         return self._words.of_frame(frame)
 
     def learn_new_nodes(self) -> None:
-        """Adds the new nodes of the graph; at first, all."""
+        """Adds the new nodes of the graph; at first all, by the stored blocks as far as they go."""
         if not len(self):
-            _ = self._words.kept  # read at once
-        for index, node in enumerate(self._graph.ids(len(self)), len(self)):
-            words = None if node is None else self._words_of_node(node)
+            self._open_blocks()
+        first = len(self)
+        stored = self._stored_words(first)
+        for index, node in enumerate(self._graph.ids(first), first):
+            words = stored.get(index + 1)
+            if words is None or node is None:
+                words = None if node is None else self._words_of_node(node)
             if words is None:  # relocalisation works without it
                 self.unreadable.add(index)
                 words = np.zeros(0, np.int32)
             with self._lock:
                 self._recogniser.add(words)
+
+    def _open_blocks(self) -> None:
+        recogniser, paged = self._recogniser, self._graph.paged
+        if paged < PLACES_PER_BLOCK or not isinstance(recogniser, StoresBlocks):
+            return
+        blocks = self._words.stored_blocks(recogniser)
+        if blocks is None:
+            return
+        numbers, unreadable = blocks.read(recogniser.rows_of_numbers)
+        count = min(numbers.shape[1], paged - paged % PLACES_PER_BLOCK)
+        if count:
+            with self._lock:
+                recogniser.open_blocks(numbers[:, :count].copy(), blocks.body)
+            self.unreadable |= {place for place in unreadable if place < count}
+            self.unreadable.update(self._graph.unused(count))
+
+    def _stored_words(self, first: int) -> dict[int, Words]:
+        """Words of the map's nodes from a dense index on, by key, which is one more."""
+        if first >= self._graph.paged or isinstance(self._recogniser, ReadsFrames):
+            return {}
+        return self._words.of_keys(first + 1, self._graph.paged)
 
     def _words_of_node(self, node: NodeId) -> Words | None:
         """As `words_of`; None if its landmarks are damaged."""

@@ -3,7 +3,7 @@
     python -m tests.maps.data.make_map FILE
 
 One map with a row of every kind: two drives, the second reverted and mapped again, one that was
-interrupted, a superseded edge, an omission, an amendment, marks, words and tags.
+interrupted, a superseded edge, an omission, an amendment, marks, words, places and tags.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from engram.graph.model import (
     Removal,
 )
 from engram.maps.map import Map
+from engram.maps.place_blocks import BODY, NUMBERS, UNREADABLE
 
 OMITTED = NodeId(UUID(int=3))
 AUTHOR = "tests"
@@ -54,6 +55,8 @@ def write_map(path: Path | str) -> None:
         write_drive(again, 5)
         again.commit()
         store.put_words(bytes(16), {other.nodes[0].id: np.array([1, 5, 9], np.int32)})
+        block = {NUMBERS: b"", UNREADABLE: np.array([3, 8191], "<i4").tobytes(), BODY: bytes(9)}
+        store.put_place_block(bytes(16), "signature", 0, block)
         zone = {Amendable.ROBOT: "robot-9", Amendable.ZONE: "Europe/London"}
         store.amend(session("robot-2").id, zone, author=AUTHOR)
         with store.begin_revision(author=AUTHOR, message="marks", configuration={}) as writer:
