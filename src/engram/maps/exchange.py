@@ -31,8 +31,8 @@ from engram.maps.view import View, head
 
 # In the order in which rows refer to each other.
 EXCHANGED: tuple[Table, ...] = (revisions, cameras, frontends, *VERSIONED, tags, words)
-# All tables but those of the format, of the tally and of the runs.
-assert len(EXCHANGED) == len(metadata.tables) - 3
+# All tables but those of the format, of the tally, of the runs and of the blocks of places.
+assert len(EXCHANGED) == len(metadata.tables) - 4
 
 _ROWS_AT_ONCE = 200
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any
 
 from sqlalchemy import Connection, delete, func, select, update
@@ -43,6 +44,14 @@ from engram.maps.schema import (
 from engram.maps.totals import Own, Totals, count_all, count_on, own_rows, state_at_head
 from engram.maps.view import LARGEST_KEY, KeyBook, View, head, place_in_history
 
+# Number, first and last key of the rows of a revision, of one table after another: as text, since
+# building 17 statements takes ten times as long as answering them.
+_COUNTED = " UNION ALL ".join(
+    f"SELECT count(*), min({key}), max({key}) FROM {table.name} "
+    f"WHERE {key} BETWEEN ? AND ? AND revision = ?"
+    for table in VERSIONED
+    for key in [table.primary_key.columns[0].name]
+)
 # Ranges of a revision without rows.
 _NOTHING = to_json({})
 
@@ -158,11 +167,11 @@ def brought(connection: Connection, row: Row) -> tuple[dict[str, float], Own]:
     own = own_rows(row)
     contents: dict[str, float] = {}
     ranges: dict[str, tuple[int, int]] = {}
-    for table in VERSIONED:
-        key = table.primary_key.columns[0]
-        query = select(func.count(), func.min(key), func.max(key)).where(own.rows(table))
-        contents[table.name], first, last = connection.execute(query).one()
-        if contents[table.name]:
+    within = [(*own.ranges.get(table.name, (0, -1)), own.key) for table in VERSIONED]
+    counted = connection.exec_driver_sql(_COUNTED, tuple(chain.from_iterable(within)))
+    for table, (count, first, last) in zip(VERSIONED, counted, strict=True):
+        contents[table.name] = count
+        if count:
             ranges[table.name] = (first, last)
     packed = select(func.sum(attempts.c.count)).where(own.rows(attempts))
     contents["attempts"] = int(connection.execute(packed).scalar() or 0)

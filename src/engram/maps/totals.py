@@ -384,6 +384,8 @@ def supersedes(connection: Connection, view: View, own: Own) -> bool:
     """Whether a row of a revision may take the place of one of `view`, or is removed there."""
     older = select(revisions.c.key).where(revisions.c.number <= view.at)
     for table, names in ((edges, ("a", "b", "kind")), (path_entries, ("path", "sequence"))):
+        if table.name not in own.ranges:
+            continue
         other = table.alias()
         same = and_(*(other.c[name] == table.c[name] for name in names))
         query = select(other.c.key).select_from(table.join(other, same))

@@ -68,21 +68,7 @@ class View:
 
     def hidden_keys(self, table: Table) -> Select[tuple[int]]:
         """Keys of the table's rows whose newest `hidden` row hides them."""
-        place = place_in_history()
-        latest = (
-            select(
-                hidden.c.target,
-                hidden.c.hidden,
-                func.row_number()
-                .over(partition_by=hidden.c.target, order_by=[place.desc(), hidden.c.key.desc()])
-                .label("age"),
-            )
-            .select_from(hidden.join(revisions, revisions.c.key == hidden.c.revision))
-            .where(hidden.c.record == table.name)
-            .where(hidden.c.revision.in_(self.revision_keys()))
-            .subquery()
-        )
-        return select(latest.c.target).where(latest.c.age == 1, latest.c.hidden == 1)
+        return _hidden_keys(self, table)
 
 
 # Cached, since reading a map needs the same statements again; views are values.
@@ -96,6 +82,25 @@ def _rows_seen(view: View, table: Table) -> Select[tuple[object, ...]]:
 @lru_cache(maxsize=256)
 def _rows_by_key(view: View, table: Table) -> Select[tuple[object, ...]]:
     return _visible(view, table).order_by(table.primary_key.columns[0])
+
+
+@lru_cache(maxsize=256)
+def _hidden_keys(view: View, table: Table) -> Select[tuple[int]]:
+    place = place_in_history()
+    latest = (
+        select(
+            hidden.c.target,
+            hidden.c.hidden,
+            func.row_number()
+            .over(partition_by=hidden.c.target, order_by=[place.desc(), hidden.c.key.desc()])
+            .label("age"),
+        )
+        .select_from(hidden.join(revisions, revisions.c.key == hidden.c.revision))
+        .where(hidden.c.record == table.name)
+        .where(hidden.c.revision.in_(view.revision_keys()))
+        .subquery()
+    )
+    return select(latest.c.target).where(latest.c.age == 1, latest.c.hidden == 1)
 
 
 def _visible(view: View, table: Table) -> Select[tuple[object, ...]]:
@@ -134,6 +139,7 @@ def head(connection: Connection) -> int:
 
 # Of 64 bits, with room left: no writer comes near it.
 LARGEST_KEY = 2**62
+_NEWEST_KEYS = "SELECT " + ", ".join(f"(SELECT max(key) FROM {one.name})" for one in KEYED)
 _NODE_OF_UUID = (
     select(nodes.c.key, nodes.c.revision)
     .where(nodes.c.uuid == bindparam("uuid"))
@@ -154,10 +160,8 @@ class KeyBook:
         # The visible revisions and the hidden nodes; read on first use.
         self._seen: tuple[frozenset[object], frozenset[object]] | None = None
         with database.reading() as connection:
-            self._next = {
-                table: (connection.execute(select(func.max(table.c.key))).scalar() or 0) + 1
-                for table in KEYED
-            }
+            newest = connection.exec_driver_sql(_NEWEST_KEYS).one()
+        self._next = {table: (key or 0) + 1 for table, key in zip(KEYED, newest, strict=True)}
 
     def next(self, table: Table) -> int:
         """An unused key of the table.
