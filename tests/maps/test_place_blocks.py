@@ -50,7 +50,8 @@ def stored(path: Path, vocabulary: bytes = ONE) -> tuple[int, set[int], list[byt
 def change(path: Path, part: str, number: int) -> None:
     with sqlite3.connect(path) as connection:
         connection.execute(
-            "UPDATE place_blocks SET content = CAST(x'07' || content AS BLOB) WHERE part = ? AND block = ?",
+            "UPDATE place_blocks SET content = CAST(x'07' || content AS BLOB) "
+            "WHERE part = ? AND block = ?",
             [part, number],
         )
     connection.close()

@@ -463,7 +463,7 @@ class Map:
     def words_between(
         self, vocabulary: bytes, first: int, last: int
     ) -> dict[int, NDArray[np.int32]]:
-        """The stored words of nodes by key, as `words`, whether a revision hides them or not."""
+        """The stored words (n,) of nodes by key, as `words`, of hidden nodes, too."""
         with self._database.reading() as connection:
             return load_words_between(connection, vocabulary, first, last)
 

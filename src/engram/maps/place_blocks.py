@@ -69,8 +69,8 @@ class StoredBlocks:
             rows: `StoresBlocks.rows_of_numbers`.
 
         Returns:
-            Numbers (rows, P) float64, P a multiple of `PLACES_PER_BLOCK`; and the places without
-            readable landmarks.
+            Numbers (rows, P) float64, log-likelihoods, P a multiple of `PLACES_PER_BLOCK`; and the
+            places without readable landmarks.
         """
         numbers, unreadable = [np.zeros((rows, 0))], set[int]()
         for number in range(self.count):
@@ -148,7 +148,8 @@ def block_parts(numbers: NDArray[np.float64], body: bytes, unreadable: list[int]
     """The content of a block by part.
 
     Args:
-        numbers, body: of the recogniser's `PlaceBlock`.
+        numbers: (rows, P) float64, log-likelihoods, of the `PlaceBlock`.
+        body: of it.
         unreadable: numbers within the block of places without readable landmarks, rising.
     """
     return {

@@ -137,7 +137,7 @@ class PlaceBlock:
 
     Attributes:
         body: what a query reads.
-        numbers: (k, PLACES_PER_BLOCK) float64, what stays in memory.
+        numbers: (k, PLACES_PER_BLOCK) float64, log-likelihoods: what stays in memory.
     """
 
     body: bytes
@@ -166,7 +166,8 @@ class StoresBlocks(Protocol):
         """Begins with stored blocks as its first places; called before any `add`.
 
         Args:
-            numbers: (k, P) float64, those of all blocks, P a multiple of `PLACES_PER_BLOCK`.
+            numbers: (k, P) float64, log-likelihoods, of all blocks, P a multiple of
+                `PLACES_PER_BLOCK`.
             read: called by each query.
         """
         ...

@@ -184,7 +184,7 @@ class NodeWords:
         return count
 
     def _keep_blocks(self, store: Map, monitor: Monitor) -> None:
-        """Stores the full blocks of FAB-MAP's places that the map lacks, of nodes that stay."""
+        """Stores the missing full blocks of FAB-MAP's places, of nodes that stay."""
         due = store.settled_nodes // PLACES_PER_BLOCK
         if not due:
             return
