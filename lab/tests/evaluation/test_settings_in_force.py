@@ -256,7 +256,7 @@ def changed(value: Any, key: str) -> Iterator[Any]:
     elif isinstance(value, float):
         yield from (0.9 * value, 1.1 * value, 0.5, 1.0)
     elif value is None:
-        yield from (9, 9.5)
+        yield from (9, 9.5, True)
     elif isinstance(value, list):
         yield from (value[:-1], [*value, *value[-1:]])
 
