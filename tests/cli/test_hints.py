@@ -114,14 +114,15 @@ def options_of(found: Any) -> set[str]:
 
 @cache
 def every_option() -> frozenset[str]:
-    """Those of every verb, the laboratory's included."""
+    """Those of every verb but the laboratory's."""
 
     def inside(commands: dict[str, Any]) -> Iterator[str]:
         for found in commands.values():
             yield from options_of(found)
             yield from inside(getattr(found, "commands", {}))
 
-    return frozenset(inside(COMMANDS)) | {"--version"}
+    ours = {name: found for name, found in COMMANDS.items() if name not in LABORATORY}
+    return frozenset(inside(ours)) | {"--version"}
 
 
 def named_commands(text: str) -> Iterator[tuple[Any, str, str]]:

@@ -67,7 +67,7 @@ def test_a_bit_says_that_it_is_set_more_often_than_usual() -> None:
 
 
 def test_other_kinds_are_refused() -> None:
-    with pytest.raises(IncompatibleError, match="have no signatures; use --relocaliser fabmap"):
+    with pytest.raises(IncompatibleError, match=r"use --set drive\.relocaliser=fabmap"):
         Signatures(default_vocabulary(BRIEF))
     with pytest.raises(IncompatibleError, match="record the drive with --features net"):
         Signatures(VOCABULARY).signature(replace(frame(7), descriptor=BRIEF))

@@ -489,7 +489,7 @@ class TestRecognition:
     def test_a_path_that_is_two_things_is_not_guessed(self, tmp_path: Path) -> None:
         path = LAYOUTS["folder"].write(tmp_path)
         (path / "cam0").mkdir()
-        with pytest.raises(SequenceError, match=r"euroc or folder.*--format"):
+        with pytest.raises(SequenceError, match=r"euroc or folder.*--set drive\.format=NAME"):
             open_drive(path)
         assert len(list(open_drive(path, format="folder"))) == PAIRS
 

@@ -340,20 +340,23 @@ def members_of(parts: NDArray[Any], count: int) -> NDArray[np.int64]:
     return members
 
 
+_FABMAP = "use --set drive.relocaliser=fabmap, or merge.relocaliser=fabmap for a merge"
+
+
 @cache
 def _arrays(kind: DescriptorKind) -> Mapping[str, NDArray[Any]]:
     """Centres (C, B) uint8 and the usual shares of their bits (C, 8·B) uint16."""
     file = resources.files("engram.places") / "data" / f"{plain_name(kind)}.signature.safetensors"
     if not file.is_file():
         raise IncompatibleError(
-            f"features of kind {plain_name(kind)} have no signatures; use --relocaliser fabmap"
+            f"features of kind {plain_name(kind)} have no signatures; {_FABMAP}"
         )
     arrays = load(file.read_bytes())
     model = bytes(arrays["model"]).decode()
     if model != kind:
         raise IncompatibleError(
             f"the installed signatures are of {model}, the landmarks of {kind}: "
-            "install Engram again, or use --relocaliser fabmap"
+            f"install Engram again, or {_FABMAP}"
         )
     return arrays
 
