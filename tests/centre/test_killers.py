@@ -6,16 +6,19 @@ import ctypes
 import os
 import signal
 import sqlite3
-from contextlib import closing
+from contextlib import closing, suppress
 
 import pytest
 
+from engram.errors import EngramError
 from engram.fleet.centre import handins, jobs, merge_job
 from engram.fleet.centre.tables import HandIn
 from engram.fleet.centre.worker import work, work_off
 from engram.maps.map import Map
 from engram.maps.rows import sealed
 from engram.maps.schema import sessions
+from engram.maps.sqlite import SqliteDatabase
+from engram.maps.upgrading import complete_history
 
 from .conftest import NAME, drive
 
@@ -121,6 +124,12 @@ def with_session(agent, **values: object) -> None:
         row = sealed(sessions, {**dict(zip(columns, found, strict=True)), **values})
         told = ", ".join(f"{name} = ?" for name in row)
         connection.execute(f"UPDATE sessions SET {told}", list(row.values()))
+    with (
+        suppress(EngramError),  # of what cannot be counted
+        closing(SqliteDatabase(agent.live)) as database,
+        database.writing() as connection,
+    ):
+        complete_history(connection)
 
 
 STRANGE = {

@@ -226,9 +226,9 @@ def orders_tried(robots: list[Path], drives: list[Path], folder: Path) -> Try:
 def test_whoever_watches_a_dream_learns_how_much_there_is_to_try(
     town, tmp_path, monkeypatch, end_s
 ):
-    monkeypatch.setattr(merge_job, "_TELL_S", 0.0)
+    monkeypatch.setattr(merge_job, "_REPORT_S", 0.0)
     told: list[str] = []
-    monitor = merge_job.Watching(lambda progress: bool(told.append(progress)))
+    monitor = merge_job.JobMonitor(lambda progress: bool(told.append(progress)))
     asked = replace(orders_tried(town[1], town[2], tmp_path / "results"), end_s=end_s)
     assert try_all({"usual": asked}, 1, None, monitor)
     assert told[-1] == "try orders: 1 of 2"

@@ -47,7 +47,7 @@ class _Nodes:
     def __len__(self) -> int:
         return self.count
 
-    edge_count = 0
+    edge_count = paged = 0
 
     def ids(self, first: int) -> range:
         return range(first, self.count)
