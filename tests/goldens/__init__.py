@@ -7,7 +7,7 @@
     python -m tests.goldens make [--only NAME]    # writes the goldens of the code as it is
     python -m tests.goldens time --against OTHER  # time against another checkout of Engram
 
-Make them anew only for a change of result that is wanted, in a commit of its own that says what
+Make them again only for a change of result that is wanted, in a commit of its own that says what
 became more accurate.
 
 Groups of cases, each one JSON file here:

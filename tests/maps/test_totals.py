@@ -17,7 +17,7 @@ from .maps import begin, edge, session, write_drive
 
 
 def compare(location: Path, at: int | None = None) -> None:
-    """The stored totals with the records, read anew."""
+    """The stored totals with the records, read again."""
     with Map.open(location, at=at) as store:
         _compare(store)
 

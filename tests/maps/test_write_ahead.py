@@ -77,7 +77,7 @@ def test_a_log_that_ends_early_is_an_earlier_state(logged):
 
 
 def test_frames_that_an_older_log_left_are_no_damage(logged):
-    """SQLite begins a log anew over the old one, with another salt."""
+    """SQLite begins a log again over the old one, with another salt."""
     log = logged.with_name("town.engram-wal")
     content = log.read_bytes()
     older = bytearray(content[_HEADER : _HEADER + _FRAME])

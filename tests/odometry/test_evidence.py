@@ -175,7 +175,7 @@ def test_sure_images_are_believed_whatever_wheels_measure(fault: str, seed: int)
 
 
 def test_wheels_settle_what_vague_steps_cannot() -> None:
-    """As by night in rain: a third of the steps are too short, with few inliers."""
+    """As at night in rain: a third of the steps are too short, with few inliers."""
     rng = np.random.default_rng(5)
     steps = [
         step(0.3 if at > 20 and rng.random() < 0.3 else rng.normal(0.7, 0.1), 60, 0.15)

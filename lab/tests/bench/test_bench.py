@@ -233,7 +233,7 @@ def test_labels_without_a_look_take_what_the_picture_has_left(
     }
 
 
-def test_many_labels_get_other_line_styles_and_begin_anew(
+def test_many_labels_get_other_line_styles_and_begin_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shown = legend_of(monkeypatch, [f"{k:02d}" for k in range(40)], {})

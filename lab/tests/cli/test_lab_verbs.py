@@ -114,7 +114,7 @@ def centre(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def night(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same street by night, of which the centre has seen nothing."""
+    """The same street at night, of which the centre has seen nothing."""
     log = tmp_path_factory.mktemp("drives") / "night.framelog"
     sequence = open_drive(street, robot="r2", recorded_at="2026-03-02T22:30:00", longitude_deg=0.0)
     extract_log(sequence, log, Settings())

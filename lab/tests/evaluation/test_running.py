@@ -497,7 +497,7 @@ def test_the_file_that_was_asked_for_longest_ago_is_closed(town: Path) -> None:
     kept.close()
 
 
-def test_a_map_that_was_made_anew_is_opened_anew(town: Path) -> None:
+def test_a_map_that_was_made_again_is_opened_again(town: Path) -> None:
     kept = KeptMaps(files=2)
     opened = kept.open(town)
     draft = town.with_name("draft.engram")

@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--uploads", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    # Here, as each process of admission loads this module anew.
+    # Here, as each process of admission loads this module itself.
     from engram_lab.mutations.case import make_samples
     from engram_lab.mutations.handins import Site
 

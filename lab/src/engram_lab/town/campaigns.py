@@ -342,7 +342,7 @@ def _oxford(seed: int, size: Size) -> Campaign:
 def _wet(seed: int, size: Size) -> Campaign:
     """A stress of world 6, never averaged with months: three of four drives in rain of 1 mm/h on.
 
-    Rates are spread over those of Oxford's rain beyond 1 mm/h; every sixth drive is by night.
+    Rates are spread over those of Oxford's rain beyond 1 mm/h; every sixth drive is at night.
     """
     count = 24
     first = datetime(2025, 9, 1, tzinfo=UTC)

@@ -1,6 +1,6 @@
 """Rain on the glass before a lens: drops that land, merge, run off and dry, and how they look.
 
-Nothing here is drawn anew from frame to frame. A pane's drops are a list that lives as long as the
+Nothing here changes at random between frames. A pane's drops are a list that lives as long as the
 drive; what a picture shows of them follows from the optics: they lie millimetres before a lens that
 is focused metres away.
 """
