@@ -146,3 +146,22 @@ def test_an_empty_map_is_no_error() -> None:
     assert len(belief.observe(np.zeros(0))) == 0
     belief.carry_on(AHEAD)
     belief.refute([])
+
+
+@pytest.mark.parametrize("carried", [5, 100])
+def test_of_a_large_graph_the_likeliest_nodes_are_carried(carried: int) -> None:
+    graph = chains(30, 20)
+    graph.add_edge(edge(3, 40, SE3(np.eye(3), np.array([0.5, 0.0, 0.4]))))
+    whole = PlaceBelief(graph)
+    large = PlaceBelief(graph, BeliefConfig(most_nodes=10, most_carried=carried))
+    rng = np.random.default_rng(1)
+    for at in range(4):
+        evidence = rng.normal(size=len(graph))
+        evidence[7 + at] = 6.0
+        expected, found = whole.observe(evidence), large.observe(evidence)
+        assert int(found.argmax()) == int(expected.argmax()) == 7 + at
+        assert (found <= expected).all()
+        if carried > len(graph):
+            assert np.array_equal(found, expected)
+        whole.carry_on(AHEAD)
+        large.carry_on(AHEAD)

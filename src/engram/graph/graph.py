@@ -664,14 +664,13 @@ class ExperienceGraph:
     def half_edges_from(self, nodes: NDArray[np.int64], reach_m: float) -> HalfEdges:
         """As `half_edges`, from some nodes, (S,) int64 dense indices, alone."""
         self._want(nodes.astype(np.int32))
-        found = [(node, half) for node in nodes.tolist() for half in self._halves(node)]
-        sources, halves = np.array(found, np.int64).reshape(-1, 2).T
-        poses = self._a_from_b.rows[halves // 2]
-        b_in_a = poses[:, 9:]
-        a_in_b = -np.einsum("nij,ni->nj", poses[:, :9].reshape(-1, 3, 3), b_in_a)
-        away = np.where((halves % 2 == 0)[:, None], b_in_a, a_in_b)
-        found_all = HalfEdges(sources.astype(np.int32), self._target.rows[halves], away)
-        return found_all.rows(np.linalg.norm(b_in_a, axis=1) <= reach_m)
+        halves = np.array(
+            [half for node in nodes.tolist() for half in self._halves(node)], np.int64
+        )
+        numbers = np.unique(halves // 2)
+        ends = self._target.rows.reshape(-1, 2)[numbers, ::-1]
+        found = HalfEdges.between(ends, self._a_from_b.rows[numbers], reach_m)
+        return found.rows(np.isin(found.sources, nodes))
 
     @property
     def edge_count(self) -> int:
