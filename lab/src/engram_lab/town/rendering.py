@@ -207,14 +207,16 @@ class Places:
         every_m: way between places.
         world: how light and weather are made.
         lens: of the robot.
+        loop_m: length of the loop.
     """
 
     def __init__(
         self, seed: int = 1, style: Style | None = None, robot: str = "wildcat",
         every_m: float = _PLACES_EVERY_M, world: World = World.FIVE, lens: Lens = CLEAN,
+        loop_m: float = LOOP_M,
     ) -> None:  # fmt: skip
         self._world, self._lens = world, lens
-        plan, route = loop_of_length(LOOP_M, seed)
+        plan, route = loop_of_length(loop_m, seed)
         self.robot: Robot = robot_named(robot)
         self._town = Town(plan, route, style or style_of(world))
         self._line = driving_line(plan, route, reverse=False)
