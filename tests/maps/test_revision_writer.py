@@ -143,6 +143,22 @@ def test_what_was_abandoned_is_collected_and_can_be_written_again(target, locati
         writer.checkpoint()
 
 
+def test_a_resumed_drive_gets_no_keys_that_are_free_again(location):
+    """Its revision began behind the rows of an abandoned one, which are gone by now."""
+    with Map.create(location) as store:
+        writer = begin(store, session("robot-1"))
+        write_drive(writer, 3)
+        writer.checkpoint()
+        writer.abandon()
+    with Map.open(location, writes=True) as store:
+        begin(store, session("robot-2"))
+    with Map.open(location, writes=True) as store:
+        writer = store.resume_session(session("robot-2").id)
+        write_drive(writer, 2)
+        assert writer.commit().contents["nodes"] == 2
+    assert check_file(location).problems == ()
+
+
 def test_killed_before_the_commit_the_map_is_as_it_was(tmp_path, source):
     path = tmp_path / "town.engram"
     with Map.create(path) as store:

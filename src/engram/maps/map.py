@@ -78,7 +78,7 @@ from engram.maps.rows import START, Row, checked_text, sealed, session_from_row,
 from engram.maps.schema import revisions
 from engram.maps.sqlite import SqliteDatabase, reading_rows
 from engram.maps.tags import Tag, TagWriter, load_tags, resolve
-from engram.maps.totals import Own, Totals, info, totals_of
+from engram.maps.totals import Own, Totals, info, own_rows, totals_of
 from engram.maps.view import KeyBook, View, head
 from engram.maps.writer import Resumable, RevisionWriter
 
@@ -715,6 +715,8 @@ class Map:
         self._check_none_open()
         row, revision = self._interrupted_rows(session)
         own = View(self._view.at, revision["key"])
+        ranges = own_rows(revision).ranges
+        self._keys.begin_at({name: first for name, (first, _) in ranges.items()})
         with self._database.writing() as connection:
             change_revision(
                 connection,

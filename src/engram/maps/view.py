@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TypeVar
@@ -181,6 +181,11 @@ class KeyBook:
     def first_keys(self, tables: Iterable[Table]) -> dict[str, int]:
         """The next key of each table, by name; that of a table without keys is its node's."""
         return {table.name: self._next[table if table in self._next else nodes] for table in tables}
+
+    def begin_at(self, first_keys: Mapping[str, int]) -> None:
+        """Gives no key below these, by table: keys of rows that were removed are free again."""
+        for table in self._next:
+            self._next[table] = max(self._next[table], first_keys.get(table.name, 0))
 
     def set_view(self, view: View) -> None:
         """Changes the visible revision."""
