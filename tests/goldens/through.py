@@ -21,7 +21,6 @@ from engram.frontend.frame import Frame, StereoPair
 from engram.frontend.frontend import Frontend
 from engram.localiser.localisation import Localisation
 from engram.maps import map_files
-from engram.maps.history import revert_revision
 from engram.maps.map import Map, open_map
 from engram.odometry.odometry import Odometry
 from engram.robot.localisers import DriveSequence, session_of_drive
@@ -145,8 +144,8 @@ def build(centre: Path, drives: list[Path], *, groups: int, threads: bool) -> Va
 
 def revert(path: Path, revision: int) -> Values:
     """Takes a revision back; how many rows of others went with it."""
-    report = revert_revision(path, revision, author="golden")
-    lost = report.reverted.lost_by_others
+    with Map.open(path) as store:
+        lost = store.revert(revision, author="golden").lost_by_others
     return {"lost_by_others": {name: count for name, count in sorted(lost.items()) if count}}
 
 

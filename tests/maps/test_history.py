@@ -114,7 +114,7 @@ class TestRevert:
         contents = store.load()
         assert contents.nodes == tuple(two[1].nodes)
         assert_same_edges(contents.edges, two[1].edges[:-1])
-        assert len(done.before.nodes) - len(done.after.nodes) == 3
+        assert done.difference.old.nodes - done.difference.new.nodes == 3
 
     def test_reverting_the_revert_brings_all_of_it_back(self, store, two, location):
         store.revert(1, author="me")
@@ -136,7 +136,7 @@ class TestRevert:
         before = store.content_hash()
         done = store.revert(1, author="me", dry_run=True)
         assert done.revision is None
-        assert len(done.after.nodes) == 3
+        assert done.difference.new.nodes == 3
         assert (store.content_hash(), store.revision) == (before, 2)
         assert_holds(store, *two)
 

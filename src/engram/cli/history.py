@@ -104,8 +104,8 @@ def diff(
 ) -> None:
     """Compare two revisions.
 
-    Lists differences in nodes, sessions, metres and hours of day, then every stretch of road that
-    changed.
+    Lists what was added and removed (nodes, sessions, edges, path entries; nodes by hour of day),
+    then each stretch of a session along which nodes changed. Only the revisions between are read.
 
     \b
     Examples:
@@ -195,11 +195,11 @@ def revert(
       engram revert town.engram 7 --dry-run
       engram revert town.engram 7 --message "the camera was loose"
     """
-    from engram.maps.history import revert_revision
+    from engram.maps.map import open_map
 
-    report = revert_revision(map_path, revision, author=user(), message=message, dry_run=dry_run)
-    made = report.reverted.revision
-    end = undo_text(map_path, made.number) if made else "dry run"
+    with open_map(map_path) as town:
+        report = town.revert(revision, author=user(), message=message, dry_run=dry_run)
+    end = undo_text(map_path, report.revision.number) if report.revision else "dry run"
     options.show(report, lambda: f"{report.text()}\n{end}", as_json=as_json)
 
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Table
+from sqlalchemy import Connection, Table, select
 
 from engram import _core
 from engram.errors import MapCorruptError
 from engram.maps.rows import describe, mismatch
-from engram.maps.view import View, places_in_history
+from engram.maps.schema import hidden, nodes, revisions
+from engram.maps.view import View, place_in_history, places_in_history
 
 _KINDS = {int: "i", float: "f", str: "s"}
 
@@ -32,6 +33,20 @@ class Columns:
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self.values[name]
+
+    def __len__(self) -> int:
+        return len(self.values["revision"])
+
+    @staticmethod
+    def verified(
+        table: Table, rows: Sequence[tuple[Any, ...]], sizes: Mapping[str, int]
+    ) -> Columns:
+        """Those of rows, in their order; see `verified_arrays`."""
+        named = verified_arrays(table, list(rows), sizes)
+        return Columns(
+            {name: array for name, array in named.items() if not isinstance(array, tuple)},
+            {name: array for name, array in named.items() if isinstance(array, tuple)},
+        )
 
     def rows(self, chosen: NDArray[np.intp]) -> Columns:
         """The chosen rows, (n,) intp by place, in that order."""
@@ -74,11 +89,7 @@ def read_columns(
         query = query.where(table.primary_key.columns[0].between(*within))
     found = connection.execute(query).cursor
     assert found is not None
-    named = verified_arrays(table, list(found.fetchall()), sizes or {})
-    whole = Columns(
-        {name: array for name, array in named.items() if not isinstance(array, tuple)},
-        {name: array for name, array in named.items() if isinstance(array, tuple)},
-    )
+    whole = Columns.verified(table, found.fetchall(), sizes or {})
     return _in_history(connection, whole)
 
 
@@ -107,3 +118,72 @@ def _in_history(connection: Connection, columns: Columns) -> Columns:
     if (np.diff(place) >= 0).all():
         return columns
     return columns.rows(np.argsort(place, kind="stable"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visible:
+    """Which rows a view shows, without asking the database.
+
+    Attributes:
+        places: of the visible revisions in the history, by key.
+        hidden: keys of hidden rows, by name of the table.
+    """
+
+    places: Mapping[int, int]
+    hidden: Mapping[str, frozenset[int]]
+
+    @staticmethod
+    def of(connection: Connection, *views: View) -> list[Visible]:
+        """What each view shows."""
+        query = select(revisions.c.key, revisions.c.status, place_in_history())
+        known = connection.execute(query.order_by(revisions.c.key)).fetchall()
+        columns = (hidden.c.revision, hidden.c.record, hidden.c.target, hidden.c.hidden)
+        said = connection.execute(select(*columns).order_by(hidden.c.key)).fetchall()
+        return [Visible._of(view, known, said) for view in views]
+
+    @staticmethod
+    def _of(view: View, known: Sequence[Any], said: Sequence[Any]) -> Visible:
+        places = {
+            key: place
+            for key, status, place in known
+            if key == view.own or (status == "committed" and place <= view.at)
+        }
+        newest = {
+            (record, target): hides
+            for revision, record, target, hides in sorted(
+                (one for one in said if one[0] in places), key=lambda one: places[one[0]]
+            )
+        }
+        found: dict[str, set[int]] = {}
+        for (record, target), hides in newest.items():
+            if hides:
+                found.setdefault(record, set()).add(target)
+        return Visible(places, {name: frozenset(keys) for name, keys in found.items()})
+
+    def has(self, table: Table, key: int, revision: int) -> bool:
+        """Whether a row is visible, by itself."""
+        return revision in self.places and key not in self.hidden_of(table)
+
+    def hidden_of(self, table: Table) -> frozenset[int]:
+        """Keys of the table's hidden rows."""
+        return self.hidden.get(table.name, _NONE)
+
+    def shows(self, table: Table, rows: Columns) -> NDArray[np.bool_]:
+        """(N,) whether rows are visible: those that refer to a hidden node are hidden with it."""
+        known, which = np.unique(rows["revision"], return_inverse=True)
+        seen = np.array([key in self.places for key in known.tolist()], np.bool_)[which]
+        key = table.primary_key.columns[0].name
+        at_nodes = [(name, nodes) for name in ("a", "b", "node") if name in table.c]
+        for name, target in ((key, table), *at_nodes):
+            if gone := self.hidden_of(target):
+                seen &= ~np.isin(rows[name], list(gone))
+        return seen
+
+    def in_history(self, rows: Columns) -> Columns:
+        """Rows ordered by revision, those of invisible ones first, and then by key."""
+        known, which = np.unique(rows["revision"], return_inverse=True)
+        place = np.array([self.places.get(key, 0) for key in known.tolist()], np.int64)[which]
+        return rows.rows(np.lexsort((rows["key"], place)))
+
+
+_NONE: frozenset[int] = frozenset()

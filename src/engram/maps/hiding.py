@@ -10,12 +10,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Table, func, insert, select
+from sqlalchemy import Connection, Table, insert, select
 
+from engram.counts import counted
 from engram.errors import InputError, RevisionError
 from engram.graph.model import Node, Session
-from engram.maps.reading import load
-from engram.maps.records import MapContents, Revision
+from engram.maps.difference import MapDifference, difference
+from engram.maps.records import Revision
 from engram.maps.rows import Row, sealed, session_row, verified
 from engram.maps.schema import (
     VERSIONED,
@@ -42,7 +43,7 @@ class Reverted:
     Attributes:
         number: the reverted revision.
         revision: the new revision; None if nothing was written.
-        before, after: the map before and after the revert.
+        difference: the map before and after.
         lost_by_others: number of rows of other revisions, by table, that are hidden with it: they
             refer to hidden nodes, or the revision had shown them again.
         regained_by_others: number of their rows, by table, that are shown again.
@@ -50,10 +51,36 @@ class Reverted:
 
     number: int
     revision: Revision | None
-    before: MapContents
-    after: MapContents
+    difference: MapDifference
     lost_by_others: Mapping[str, int]
     regained_by_others: Mapping[str, int]
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``revert --json`` prints."""
+        return {
+            "reverted": self.number,
+            "revision": None if self.revision is None else self.revision.number,
+            "lost_by_others": dict(self.lost_by_others),
+            "regained_by_others": dict(self.regained_by_others),
+            "difference": self.difference.to_dict(),
+        }
+
+    def text(self) -> str:
+        """The result as text."""
+        old, new = self.difference.old, self.difference.new
+        by = "would be reverted" if self.revision is None else f"reverted by {self.revision.number}"
+        lines = [
+            f"revision {self.number} {by}",
+            f"nodes      {old.nodes} → {new.nodes}",
+            f"components {old.components} → {new.components}",
+        ]
+        if lost := _rows_text(self.lost_by_others):
+            lines.append(f"other revisions depend on it: {lost} of theirs are hidden with it")
+        if regained := _rows_text(self.regained_by_others):
+            lines.append(f"of other revisions, {regained} are shown again")
+        if new.components > old.components:
+            lines.append("the map has more components: positions cannot be carried between them")
+        return "\n".join(lines)
 
 
 def hidden_row(keys: KeyBook, revision_key: int, table: Table, target: int, *, hide: bool) -> Row:
@@ -197,19 +224,29 @@ def _invert_hidden(
     return len(rows)
 
 
-def compare(connection: Connection, number: int, before: View, after: View) -> Reverted:
-    """The map before and after an uncommitted revert."""
-    lost, regained = {}, {}
-    for table in (edges, path_entries, omissions):
-        # By row, not by count: losses and gains must not cancel.
-        old, new = (_of_others(connection, view, table, number) for view in (before, after))
-        lost[str(table.name)] = len(old - new)
-        regained[str(table.name)] = len(new - old)
-    contents = load(connection, before), load(connection, after)
-    return Reverted(number, None, *contents, lost, regained)
+def compare(connection: Connection, number: int, before: int, after: Revision) -> Reverted:
+    """The map before and after a revert."""
+    found = difference(connection, before, after.number)
+    query = select(revisions.c.key).where(revisions.c.number == number)
+    key = connection.execute(query).scalar_one()
+    lost, regained = (
+        {
+            str(table.name): int((touched.seen[side] & ~touched.seen[1 - side] & others).sum())
+            for table in (edges, path_entries, omissions)
+            for touched in [found.changes[table]]
+            for others in [touched.rows["revision"] != key]
+        }
+        for side in (0, 1)
+    )
+    return Reverted(number, after, found, lost, regained)
 
 
-def _of_others(connection: Connection, view: View, table: Table, number: int) -> set[int]:
-    """Keys of the visible rows that the revision did not add."""
-    rows = view.select(table).where(func.coalesce(revisions.c.number, 0) != number)
-    return set(connection.execute(rows.with_only_columns(table.c.key).order_by(None)).scalars())
+def _rows_text(counts: Mapping[str, int]) -> str:
+    """Number of rows by table, without tables that have none."""
+    return ", ".join(counted(count, _one_of(name)) for name, count in counts.items() if count)
+
+
+def _one_of(table: str) -> str:
+    """A row of a table, as it is called: `path_entries` has path entries."""
+    name = table.replace("_", " ")
+    return f"{name[:-3]}y" if name.endswith("ies") else name.removesuffix("s")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,10 +10,9 @@ from typing import Any
 from engram.counts import counted
 from engram.graph.clock import hour_of_day, zone_note
 from engram.graph.model import Clock, Session
-from engram.maps.difference import MapDifference, difference, hours_of_nodes
-from engram.maps.hiding import Reverted
+from engram.maps.difference import MapDifference
 from engram.maps.map import open_map
-from engram.maps.records import MapContents, Revision
+from engram.maps.records import Revision
 from engram.maps.tags import Tag
 
 # Contents of a revision, in the order in which `log` prints them.
@@ -70,19 +67,15 @@ def show_revision(path: Path, named: int | str) -> tuple[dict[str, Any], MapDiff
         MapError: the map cannot be read, or has no such revision.
     """
     with open_map(path, at=named) as store:
+        revision, tags = store.newest_revision(), _names(store.tags())
         number = store.revision
-        revision = _revision(store.log()[-1], _names(store.tags())) if number else {}
-        new = store.load()
         shown = {
-            **revision,
+            **({} if revision is None else _revision(revision, tags)),
             "number": number,
             "content_hash": store.content_hash(),
-            "configuration": dict(store.log()[-1].configuration) if number else {},
-            "sessions": sessions_of(new),
-            "hours": hours_of_nodes(new),
+            "configuration": {} if revision is None else dict(revision.configuration),
         }
-    with open_map(path, at=max(number - 1, 0)) as store:
-        return shown, difference(max(number - 1, 0), store.load(), number, new)
+        return shown, store.diff(max(number - 1, 0), number)
 
 
 def map_tags(path: Path) -> list[dict[str, Any]]:
@@ -104,75 +97,6 @@ def tag_dict(tag: Tag) -> dict[str, Any]:
         "message": tag.message,
         "when": when(tag.tagged_ns),
     }
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RevertReport:
-    """The result of reverting a revision, or of a dry run.
-
-    Attributes:
-        reverted: the map before and after.
-        difference: the comparison of the two.
-    """
-
-    reverted: Reverted
-    difference: MapDifference
-
-    def to_dict(self) -> dict[str, Any]:
-        """What ``revert --json`` prints."""
-        revision = self.reverted.revision
-        return {
-            "reverted": self.reverted.number,
-            "revision": None if revision is None else revision.number,
-            "lost_by_others": dict(self.reverted.lost_by_others),
-            "regained_by_others": dict(self.reverted.regained_by_others),
-            "difference": self.difference.to_dict(),
-        }
-
-    def text(self) -> str:
-        """The result as text."""
-        told = self.difference.to_dict()
-        revision = self.reverted.revision
-        done = "would be reverted" if revision is None else f"reverted by {revision.number}"
-        lines = [
-            f"revision {self.reverted.number} {done}",
-            f"nodes      {told['nodes']['before']} → {told['nodes']['after']}",
-            f"components {told['components']['before']} → {told['components']['after']}",
-        ]
-        if lost := _rows_text(self.reverted.lost_by_others):
-            lines.append(f"other revisions depend on it: {lost} of theirs are hidden with it")
-        if regained := _rows_text(self.reverted.regained_by_others):
-            lines.append(f"of other revisions, {regained} are shown again")
-        if told["components"]["after"] > told["components"]["before"]:
-            lines.append("the map has more components: positions cannot be carried between them")
-        return "\n".join(lines)
-
-
-def _rows_text(counts: Mapping[str, int]) -> str:
-    """Number of rows by table, without tables that have none."""
-    return ", ".join(counted(count, _one_of(name)) for name, count in counts.items() if count)
-
-
-def _one_of(table: str) -> str:
-    """A row of a table, as it is called: `path_entries` has path entries."""
-    name = table.replace("_", " ")
-    return f"{name[:-3]}y" if name.endswith("ies") else name.removesuffix("s")
-
-
-def revert_revision(
-    path: Path, named: int | str, *, author: str, message: str = "", dry_run: bool = False
-) -> RevertReport:
-    """Reverts a revision by a new one, and reports the changes.
-
-    Raises:
-        RevisionError: there is no such revision, or nothing of it is visible.
-        MapError: the map cannot be written.
-    """
-    with open_map(path) as store:
-        head = store.revision
-        done = store.revert(named, author=author, message=message, dry_run=dry_run)
-    after = head + 1 if done.revision is None else done.revision.number
-    return RevertReport(done, difference(head, done.before, after, done.after))
 
 
 def blame_node(path: Path, prefix: str) -> dict[str, Any]:
@@ -270,19 +194,3 @@ def _contents_text(contents: Mapping[str, float]) -> str:
     if contents.get("mapped_m"):
         told.append(f"{contents['mapped_m']:.1f} m mapped")
     return ", ".join(told) or "nothing"
-
-
-def sessions_of(contents: MapContents) -> list[dict[str, Any]]:
-    """The sessions of a map as plain values."""
-    nodes = Counter(node.session for node in contents.nodes)
-    return [
-        {
-            "session": str(session.id),
-            "robot": session.robot,
-            "start": stamp_text(session, session.start_ns),
-            "hour": hour_of_day(session, session.start_ns),
-            "note": zone_note(session),
-            "nodes": nodes[session.id],
-        }
-        for session in contents.sessions
-    ]

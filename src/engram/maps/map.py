@@ -561,8 +561,7 @@ class Map:
         """
         numbers = self.resolve(before), self.resolve(after)
         with self._database.reading() as connection:
-            old, new = (reading.load(connection, View(number)) for number in numbers)
-        return difference(numbers[0], old, numbers[1], new, stretch_m)
+            return difference(connection, *numbers, stretch_m)
 
     def origin(self, prefix: str) -> Origin:
         """The origin of a node, even of one that a revert has hidden.
@@ -794,13 +793,12 @@ class Map:
                 connection.execute(insert(revisions), [sealed(revisions, opened)])
                 own = View(self._view.at, opened["key"])
                 hide_revision(connection, self._keys, own, number, opened["key"])
-                done = compare(connection, number, self._view, own)
+                revision = commit_revision(connection, opened["key"], was=RevisionStatus.ABANDONED)
+                done = compare(connection, number, self.revision, revision)
                 if dry_run:
                     raise _DryRunError
-                revision = commit_revision(connection, opened["key"], was=RevisionStatus.ABANDONED)
-                done = replace(done, revision=revision)
         except _DryRunError:
-            return done
+            return replace(done, revision=None)
         self.frames.forget()
         self.forget()
         self._keys.forget_nodes()

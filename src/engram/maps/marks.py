@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -144,18 +144,20 @@ def goal_from_row(row: Row, ids: Mapping[int, NodeId]) -> Goal:
 
 def counting(connection: Connection, view: View, rows: list[Row]) -> list[Row]:
     """The rows of edges without those that were removed."""
-    removed = removed_measurements(connection, view)
+    removed = removed_measurements(view.rows(connection, removals))
     if not removed:
         return rows
     return [row for row in rows if not is_removed(row, removed.get(edge_key(row), []))]
 
 
-def removed_measurements(
-    connection: Connection, view: View
-) -> dict[tuple[frozenset[int], str], list[tuple[int, SE3]]]:
-    """What was removed by `edge_key`: from which end, and the transform to the other."""
-    removed: dict[tuple[frozenset[int], str], list[tuple[int, SE3]]] = {}
-    for row in view.rows(connection, removals):
+# What was removed by `edge_key`: from which end, and the transform to the other.
+Removed = dict[tuple[frozenset[int], str], list[tuple[int, SE3]]]
+
+
+def removed_measurements(rows: Iterable[Row]) -> Removed:
+    """What these rows of removals remove."""
+    removed: Removed = {}
+    for row in rows:
         a_from_b = transform_from_bytes(row["a_from_b"], f"removal {row['key']}")
         removed.setdefault(edge_key(row), []).append((row["a"], a_from_b))
     return removed
@@ -175,9 +177,7 @@ def is_removed(row: Row, removed: list[tuple[int, SE3]]) -> bool:
     return any(same_measurement(was, a_from_b if a == row["a"] else inverse) for a, was in removed)
 
 
-def without_removed(
-    removed: dict[tuple[frozenset[int], str], list[tuple[int, SE3]]], found: Columns
-) -> Columns:
+def without_removed(removed: Removed, found: Columns) -> Columns:
     """The edges without those that were removed; hardly any map has some."""
     if not removed:
         return found

@@ -7,7 +7,7 @@ the nodes of a page were saved one after another.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import (
     BindParameter,
-    Connection,
     Table,
     and_,
     bindparam,
@@ -34,7 +33,7 @@ from engram.graph.model import EdgeKind, NodeId, PathEntryKind, PathId, SessionI
 from engram.graph.pages import PAGE, GraphPage
 from engram.graph.paths import ENTRY_KINDS, Attempts, Evidence
 from engram.maps.attempts import unpack
-from engram.maps.columns import Columns, read_columns, verified_arrays
+from engram.maps.columns import Columns, Visible, read_columns
 from engram.maps.marks import removed_measurements, without_removed
 from engram.maps.reading import load_cameras, sessions_by_key
 from engram.maps.rows import (
@@ -45,10 +44,10 @@ from engram.maps.rows import (
     uuid_from_bytes,
     verified,
 )
-from engram.maps.schema import attempts, edges, nodes, path_entries, paths, revisions
+from engram.maps.schema import attempts, edges, nodes, path_entries, paths, removals, revisions
 from engram.maps.sqlite import SqliteDatabase, reading_rows
 from engram.maps.totals import own_rows
-from engram.maps.view import View, place_in_history
+from engram.maps.view import View
 
 # Dense indices are of 32 bits; what a process adds follows after those of the map.
 _LARGEST_KEY = 2**31 - 2**24
@@ -74,9 +73,9 @@ class MapPages:
             self.sessions: Sequence[SessionId] = [one.id for one in known.values()]
             self._session_numbers = {key: number for number, key in enumerate(known)}
             self._cameras: dict[int, CameraId] = {key: one.id for key, one in cameras.items()}
-            self._visible = _Visible.of(connection, view)
+            (self._visible,) = Visible.of(connection, view)
             path_rows = list(view.rows(connection, paths))
-            self._removed = removed_measurements(connection, view)
+            self._removed = removed_measurements(view.rows(connection, removals))
             newest = connection.execute(select(func.max(nodes.c.key))).scalar() or 0
         if newest > _LARGEST_KEY:
             raise MapCorruptError(f"{database.name}: a node has the key {newest}; run engram check")
@@ -90,9 +89,9 @@ class MapPages:
         """See `GraphPages`."""
         keys = {"first": number * PAGE + 1, "last": (number + 1) * PAGE}
         with reading_rows(self._database.name):
-            found = self._visible.of_rows(nodes, self._database.rows(_NODES, keys), _NODE_SIZES)
+            found = self._seen(nodes, self._database.rows(_NODES, keys), _NODE_SIZES)
             found = found.rows(np.argsort(found["key"], kind="stable"))
-            joined = self._visible.of_rows(edges, self._database.rows(_EDGES, keys), _EDGE_SIZES)
+            joined = self._seen(edges, self._database.rows(_EDGES, keys), _EDGE_SIZES)
             return GraphPage(
                 number,
                 (found["key"] - 1).astype(np.int32),
@@ -133,7 +132,7 @@ class MapPages:
                 yield from (index for index, node in found if node is None)
             next_key = last + 1
         yield from range(next_key - 1, end)
-        hidden = self._visible.hidden[nodes]
+        hidden = self._visible.hidden_of(nodes)
         yield from (key - 1 for key in hidden if key <= end)
 
     def _ranges(self) -> Iterator[tuple[int, int, bool]]:
@@ -167,7 +166,7 @@ class MapPages:
                 for query in (_ENTRIES, _SAME_PLACES)
                 for row in self._database.rows(query, keys)
             }
-            found = self._visible.of_rows(path_entries, list(rows.values()), {})
+            found = self._seen(path_entries, list(rows.values()), {})
             known = np.isin(found["path"], list(self._path_numbers))
             found = found.rows(np.flatnonzero(known)).newest("path", "sequence")
             here = (found["node"] > first) & (found["node"] <= end)
@@ -212,9 +211,9 @@ class MapPages:
         """The evidence of a range, by successes and failures of all nodes and silent paths."""
         keys = {"first": first + 1, "last": end}
         with reading_rows(self._database.name):
-            found = self._visible.of_rows(nodes, self._database.rows(_NODES, keys), _NODE_SIZES)
+            found = self._seen(nodes, self._database.rows(_NODES, keys), _NODE_SIZES)
             found = found.rows(np.argsort(found["key"], kind="stable"))
-            joined = self._visible.of_rows(edges, self._database.rows(_STEPS, keys), _EDGE_SIZES)
+            joined = self._seen(edges, self._database.rows(_STEPS, keys), _EDGE_SIZES)
             at, sessions = (found["key"] - 1).astype(np.int32), self._numbered(found)
             links = np.searchsorted(at, self._edges(joined)[0])
             links = links[sessions[links[:, 0]] == sessions[links[:, 1]]]
@@ -227,7 +226,7 @@ class MapPages:
 
     def _drives(self) -> Iterator[tuple[int, Attempts]]:
         """The attempts between visible nodes of one session after another, with its number."""
-        hidden = np.array(list(self._visible.hidden[nodes]), np.int64)
+        hidden = np.array(list(self._visible.hidden_of(nodes)), np.int64)
         for key, number in self._session_numbers.items():
             rows = [
                 row
@@ -270,6 +269,14 @@ class MapPages:
         a, b = sessions[ends].T
         return labels_of(ends[(a == b) & (a >= 0)] - 1, self.end)
 
+    def _seen(
+        self, table: Table, rows: Sequence[tuple[Any, ...]], sizes: dict[str, int]
+    ) -> Columns:
+        """The visible ones of some rows, verified, by revision and then by key."""
+        found = Columns.verified(table, rows, sizes)
+        found = found.rows(np.flatnonzero(self._visible.shows(table, found)))
+        return self._visible.in_history(found)
+
     def _edges(
         self, found: Columns
     ) -> tuple[NDArray[np.int32], NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]:
@@ -298,59 +305,6 @@ class MapPages:
         if key not in self._cameras:
             raise MapCorruptError(f"table nodes: a node's camera, row {key}, is missing")
         return self._cameras[key]
-
-
-@dataclass(frozen=True, slots=True)
-class _Visible:
-    """Which rows a view shows, without asking the database.
-
-    Attributes:
-        places: of the visible revisions in the history, by key.
-        hidden: keys of hidden rows, by table.
-    """
-
-    places: dict[int, int]
-    hidden: dict[Table, frozenset[Any]]
-
-    @staticmethod
-    def of(connection: Connection, view: View) -> _Visible:
-        query = select(revisions.c.key, place_in_history()).where(
-            revisions.c.key.in_(view.revision_keys())
-        )
-        return _Visible(
-            dict(map(tuple, connection.execute(query))),
-            {
-                one: frozenset(row[0] for row in connection.execute(view.hidden_keys(one)))
-                for one in (nodes, edges, path_entries, attempts)
-            },
-        )
-
-    def has(self, table: Table, key: int, revision: int) -> bool:
-        """Whether a row is visible."""
-        return revision in self.places and key not in self.hidden[table]
-
-    def of_rows(
-        self, table: Table, rows: Sequence[tuple[Any, ...]], sizes: dict[str, int]
-    ) -> Columns:
-        """The visible ones of some rows, verified, by revision and then by key."""
-        arrays = verified_arrays(table, list(rows), sizes)
-        found = Columns(
-            {name: array for name, array in arrays.items() if not isinstance(array, tuple)},
-            {name: array for name, array in arrays.items() if isinstance(array, tuple)},
-        )
-        known, which = np.unique(found["revision"], return_inverse=True)
-        place = np.array([self.places.get(key, -1) for key in known.tolist()], np.int64)[which]
-        seen = place >= 0
-        for name, hidden in (("key", self.hidden[table]), *_ends_of(table, self.hidden[nodes])):
-            if hidden:
-                seen &= ~np.isin(found[name], list(hidden))
-        order = np.lexsort((found["key"], place))
-        return found.rows(order[seen[order]])
-
-
-def _ends_of(table: Table, hidden: frozenset[int]) -> list[tuple[str, frozenset[int]]]:
-    """Columns that refer to nodes, each with the hidden nodes."""
-    return [(name, hidden) for name in ("a", "b", "node") if name in table.c]
 
 
 _MANY = 4096

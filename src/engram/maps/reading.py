@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -58,17 +58,19 @@ from engram.maps.schema import (
     omitted_landmarks,
     path_entries,
     paths,
+    removals,
     revisions,
     sessions,
     statistics,
     vocabularies,
 )
-from engram.maps.view import View
+from engram.maps.view import View, few
 
 # As many UUIDs as one statement takes.
 _FEW = 500
 # Most numbers per key that a table of all of them may span.
 _DENSE = 16
+_KEY = sessions.c.key
 
 
 def load(connection: Connection, view: View) -> MapContents:
@@ -104,12 +106,21 @@ def load_amendments(connection: Connection, view: View) -> tuple[Amendment, ...]
 
 
 def sessions_by_key(
-    connection: Connection, view: View, known_cameras: dict[int, StereoCamera]
+    connection: Connection,
+    view: View,
+    known_cameras: dict[int, StereoCamera],
+    among: Collection[int] | None = None,
 ) -> dict[int, Session]:
-    """Sessions by key, with their amendments applied."""
+    """Sessions by key, with their amendments applied; of all keys, or of these."""
+    parts = [None] if among is None else few(sorted(among))
+    queries = (
+        view.select(sessions) if part is None else view.select(sessions).where(_KEY.in_(part))
+        for part in parts
+    )
     recorded = {
         row["key"]: session_from_row(row, _camera_id(known_cameras, row, "session"))
-        for row in view.rows(connection, sessions)
+        for query in queries
+        for row in verified(sessions, connection.execute(query))
     }
     for key, amendment in _amendments(connection, view, recorded):
         recorded[key] = amendment.applied(recorded[key])
@@ -356,7 +367,7 @@ def _edges(
     """Edges between visible nodes: those of hidden nodes are hidden with them."""
     sizes = {"a_from_b": 96, "covariance": 168}
     found = read_columns(connection, view, edges, sizes).newest("a", "b", "kind")
-    found = without_removed(removed_measurements(connection, view), found)
+    found = without_removed(removed_measurements(view.rows(connection, removals)), found)
     (a, a_seen), (b, b_seen) = (_dense(found[end], node_keys) for end in ("a", "b"))
     seen = np.flatnonzero(a_seen & b_seen)
     found, ends = found.rows(seen), np.column_stack([a, b])[seen]

@@ -14,7 +14,9 @@ from engram.errors import MapCorruptError, RevisionError
 from engram.files import Holder
 from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, SessionId, path_id
 from engram.maps import reading
+from engram.maps.changes import Changes
 from engram.maps.content import chained, content_hash
+from engram.maps.counting import count_on
 from engram.maps.records import InterruptedSession, Revision, RevisionStatus, StoredSession
 from engram.maps.rows import (
     Row,
@@ -41,7 +43,7 @@ from engram.maps.schema import (
     sessions,
     words,
 )
-from engram.maps.totals import Own, Totals, count_all, count_on, own_rows, state_at_head
+from engram.maps.totals import Own, Totals, count_all, own_rows, state_at_head
 from engram.maps.view import LARGEST_KEY, KeyBook, View, head, place_in_history
 
 # Number, first and last key of the rows of a revision, of one table after another: as text, since
@@ -122,8 +124,12 @@ def commit_revision(
 def _count_own(connection: Connection, parent: int, own: Own) -> Totals:
     """The totals with the rows of a revision; writes the runs."""
     before, runs = state_at_head(connection, parent)
-    counted = None if runs is None else count_on(connection, View(parent), before, runs, own)
-    totals, after = counted or count_all(connection, View(parent, own.key))
+    view = View(parent, own.key)
+    if runs is None:
+        totals, after = count_all(connection, view)
+    else:
+        changes = Changes.between(connection, View(parent), view)
+        totals, after = count_on(connection, view, before, runs, changes)
     save_runs(connection, runs, after)
     return totals
 

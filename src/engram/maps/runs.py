@@ -6,8 +6,8 @@ commit reads all runs, and no edge but its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,49 @@ class Runs:
         parts = zip(self._arrays(), (nodes,) * 4, strict=True)
         both = Runs(*(np.concatenate(part) for part in parts))
         return both._rows(np.argsort(both.first, kind="stable"))
+
+    def stretches(self, experience: int) -> list[tuple[int, int]]:
+        """First and last node of each run of an experience."""
+        at = np.flatnonzero(self.experience == experience)
+        return list(zip(self.first[at].tolist(), self.last[at].tolist(), strict=True))
+
+    def without(self, nodes: Keys) -> Runs:
+        """These without some of their nodes, (N,) keys."""
+        found = self._cut(nodes)
+        return found._rows(np.flatnonzero(~np.isin(found.first, nodes)))._named()
+
+    def with_chains(self, chains: Sequence[Keys]) -> Runs:
+        """These, where the nodes of each chain, (N,) keys, are an experience by themselves."""
+        found = self._cut(np.concatenate([np.zeros(0, np.int64), *chains]))
+        experience = found.experience.copy()
+        for number, chain in enumerate(chains):
+            experience[found.find(chain)] = -1 - number
+        return replace(found, experience=experience)._named()
+
+    def with_components(self, parts: Sequence[Keys]) -> Runs:
+        """These, where the experiences of each part, (N,), are a component by themselves."""
+        component = self.component.copy()
+        for number, part in enumerate(parts):
+            component[np.isin(self.experience, part)] = -1 - number
+        return replace(self, component=component)._named()
+
+    def _named(self) -> Runs:
+        """These, with experiences and components named by their first nodes."""
+        labels = []
+        for known in (self.experience, self.component):
+            _, least, which = np.unique(known, return_index=True, return_inverse=True)
+            labels.append(self.first[least][which])
+        return Runs(self.first, self.last, *labels)
+
+    def _cut(self, nodes: Keys) -> Runs:
+        """These, with a run of its own for each of some nodes, (N,) keys."""
+        first = np.unique(np.concatenate([self.first, nodes, nodes + 1]))
+        at = self.find(first)
+        first, at = first[at >= 0], at[at >= 0]
+        last = np.minimum(
+            np.append(first[1:] - 1, np.iinfo(np.int64).max)[: len(at)], self.last[at]
+        )
+        return Runs(first, last, self.experience[at], self.component[at])
 
     def joined(self, chained: Keys, ends: Keys) -> Runs:
         """These, joined by edges between their nodes.

@@ -6,7 +6,7 @@ is counted with the whole map, in stretches of its rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
@@ -90,15 +90,15 @@ class Totals:
 
     def agrees(self, other: Totals) -> bool:
         """Whether they are equal, but for the rounding of sums and of places."""
-        (exact, rough), (its_exact, its_rough) = self._parts(), other._parts()
+        cameras = sorted({*self.forward, *other.forward})
+        (exact, rough), (its_exact, its_rough) = (one._parts(cameras) for one in (self, other))
         return exact == its_exact and np.allclose(rough, its_rough)
 
-    def _parts(self) -> tuple[Totals, list[float]]:
-        cameras = sorted(self.forward)
+    def _parts(self, cameras: Sequence[CameraId]) -> tuple[Totals, list[float]]:
         rough = [self.mapped_m, self.right_m or 0.0]
-        rough += [shift_m for camera in cameras for shift_m in self.forward[camera]]
-        nowhere = dict.fromkeys(cameras, (0.0,) * 3)
-        return replace(self, mapped_m=0.0, right_m=None, forward=nowhere), rough
+        # Edges that are gone may leave the rounding of their sum.
+        rough += [shift for one in cameras for shift in self.forward.get(one, (0.0,) * 3)]
+        return replace(self, mapped_m=0.0, right_m=None, forward={}), rough
 
     def of_runs(self, runs: Runs) -> Totals:
         """With the numbers that follow from the runs."""
@@ -200,59 +200,19 @@ def count_all(connection: Connection, view: View) -> tuple[Totals, Runs]:
         paths=_count(connection, view.select(paths)),
         path_entries=_count(connection, places),
         attempts=int(connection.execute(seen).scalar() or 0),
-        right_m=_right_m(connection, view),
+        right_m=right_m_of(connection, view),
     )
     known = [
         (part["key"], part["session"], part["camera"])
         for part in _stretches(connection, view, nodes, _NODE_BYTES)
     ]
-    owners = _Owners(connection, *(np.concatenate(part) for part in zip(*known, strict=True)))
+    owners = Owners(connection, *(np.concatenate(part) for part in zip(*known, strict=True)))
     runs = Runs.of(owners.nodes)
     skipped = np.array(sorted(_uncounted(connection, view)), np.int64)
-    for part in _stretches(connection, view, edges, _EDGE_BYTES):
-        found, runs = _with_edges(found, runs, part, skipped, owners)
+    for stretch in _stretches(connection, view, edges, _EDGE_BYTES):
+        part = stretch.rows(np.flatnonzero(~np.isin(stretch["key"], skipped)))
+        found, runs = with_edges(found, part, owners), runs.joined(*joints(part, owners))
     return found.of_runs(runs), runs
-
-
-def count_on(
-    connection: Connection, view: View, before: Totals, runs: Runs, own: Own
-) -> tuple[Totals, Runs] | None:
-    """The totals after a revision that only adds; None if it does anything else.
-
-    Args:
-        connection: of the map.
-        view: the revision before.
-        before: the totals as of the revision before.
-        runs: its runs.
-        own: the rows of this revision.
-    """
-    if {"hidden", "removals"} & own.ranges.keys():
-        return None
-    fresh = own.columns(connection, nodes, _NODE_BYTES)
-    placed = own.columns(connection, placements, {"map_from_node": 96})
-    if not np.isin(placed["node"], fresh["key"]).all() or supersedes(connection, view, own):
-        return None
-    count = {table.name: _own_count(connection, own, table) for table in _COUNTED}
-    made = select(func.sum(attempts.c.count)).where(own.rows(attempts))
-    x_m = placed["map_from_node"].view("<f8")[:, 9]
-    seen = _cameras(connection, *(select(one).where(own.rows(one)) for one in (sessions, nodes)))
-    found = replace(
-        before,
-        cameras=tuple(sorted({*before.cameras, *seen})),
-        sessions=before.sessions + count[sessions.name],
-        paths=before.paths + count[paths.name],
-        path_entries=before.path_entries + count[path_entries.name],
-        attempts=before.attempts + int(connection.execute(made).scalar() or 0),
-        right_m=_greater(before.right_m, x_m),
-    )
-    owners = _Owners(connection, fresh["key"], fresh["session"], fresh["camera"])
-    added = own.columns(connection, edges, _EDGE_BYTES)
-    nothing = np.zeros(0, np.int64)
-    found, runs = _with_edges(found, runs.with_nodes(fresh["key"]), added, nothing, owners)
-    return found.of_runs(runs), runs
-
-
-_COUNTED = (sessions, paths, path_entries)
 
 
 def _cameras(connection: Connection, *rows: Select[Any]) -> tuple[CameraId, ...]:
@@ -268,7 +228,7 @@ def _cameras(connection: Connection, *rows: Select[Any]) -> tuple[CameraId, ...]
     return tuple(sorted(known[key].id for key in keys))
 
 
-class _Owners:
+class Owners:
     """The session and the camera of nodes: of given ones, and of others by a look-up.
 
     Args:
@@ -310,37 +270,41 @@ class _Owners:
             self._values = np.concatenate([self._values, known[:, 1:]])[order]
 
 
-def _with_edges(
-    before: Totals, runs: Runs, added: Columns, skipped: Keys, owners: _Owners
-) -> tuple[Totals, Runs]:
-    """The totals and runs with these edges, but for those with the keys `skipped`."""
-    chosen = np.flatnonzero(~np.isin(added["key"], skipped))
-    added = added.rows(chosen)
+def with_edges(before: Totals, added: Columns, owners: Owners, sign: int = 1) -> Totals:
+    """The totals with these edges; without them if `sign` is -1."""
     codes, texts = added.texts["kind"]
-    ends = np.column_stack([added["a"], added["b"]]).reshape(-1, 2)
     by_kind = dict(before.edges)
     for code, count in enumerate(np.bincount(codes, minlength=len(texts)).tolist()):
-        if count:
-            by_kind[texts[code]] = by_kind.get(texts[code], 0) + count
-    odometry = [at for at, text in enumerate(texts) if text == EdgeKind.ODOMETRY]
-    steps = np.flatnonzero(np.isin(codes, odometry))
-    shifts = added["a_from_b"][steps].view("<f8")[:, 9:]
-    sessions_of, cameras_of = owners.of(ends[steps].ravel()).reshape(-1, 2, 2).transpose(2, 0, 1)
+        by_kind[texts[code]] = by_kind.get(texts[code], 0) + sign * count
+    steps = np.flatnonzero(_are_steps(added))
+    shifts = sign * added["a_from_b"][steps].view("<f8")[:, 9:]
+    cameras = owners.of(added["b"][steps])[:, 1]
     forward = {key: np.array(value) for key, value in before.forward.items()}
     mapped_m = before.mapped_m
     # One after the other: sums then do not depend on where one commit ends.
-    for camera, shift in zip(cameras_of[:, 1].tolist(), shifts, strict=True):
-        mapped_m += float(np.sqrt(shift @ shift))
+    for camera, shift in zip(cameras.tolist(), shifts, strict=True):
+        mapped_m += sign * float(np.sqrt(shift @ shift))
         known = forward.setdefault(owners.cameras[camera], np.zeros(3))
         known += shift
-    chained = ends[steps][sessions_of[:, 0] == sessions_of[:, 1]]
-    totals = replace(
+    return replace(
         before,
-        edges=by_kind,
-        mapped_m=mapped_m,
+        edges={kind: count for kind, count in by_kind.items() if count},
+        mapped_m=mapped_m if by_kind.get(EdgeKind.ODOMETRY) else 0.0,
         forward={key: tuple(value.tolist()) for key, value in forward.items()},
     )
-    return totals, runs.joined(chained, ends)
+
+
+def joints(added: Columns, owners: Owners) -> tuple[Keys, Keys]:
+    """Ends (C, 2) of the odometry edges within drives, and (E, 2) of all edges."""
+    ends = np.column_stack([added["a"], added["b"]]).reshape(-1, 2)
+    steps = ends[_are_steps(added)]
+    drives = owners.of(steps.ravel())[:, 0].reshape(-1, 2)
+    return steps[drives[:, 0] == drives[:, 1]], ends
+
+
+def _are_steps(added: Columns) -> NDArray[np.bool_]:
+    codes, texts = added.texts["kind"]
+    return np.isin(codes, [at for at, text in enumerate(texts) if text == EdgeKind.ODOMETRY])
 
 
 def _stretches(
@@ -401,8 +365,8 @@ def supersedes(connection: Connection, view: View, own: Own) -> bool:
     return False
 
 
-def _right_m(connection: Connection, view: View) -> float | None:
-    """The largest x of the newest place of each node."""
+def right_m_of(connection: Connection, view: View) -> float | None:
+    """The largest x of the newest place of each node, metres, from all places."""
     parts = [
         (part["node"], part["revision"], part["key"], part["map_from_node"].view("<f8")[:, 9])
         for part in _stretches(connection, view, placements, {"map_from_node": 96})
@@ -413,19 +377,15 @@ def _right_m(connection: Connection, view: View) -> float | None:
     place = np.array([place_of[one] for one in known.tolist()], np.int64)[which]
     order = np.lexsort((key, place, node))
     newest = np.flatnonzero(np.diff(node[order], append=-1))
-    return _greater(None, x_m[order][newest])
+    return greater_m(None, x_m[order][newest])
 
 
-def _greater(known: float | None, values: NDArray[np.float64]) -> float | None:
+def greater_m(known: float | None, values: NDArray[np.float64]) -> float | None:
+    """The largest of a value and others (N,), metres; None if there is none."""
     if not len(values):
         return known
     most = float(values.max())
     return most if known is None else max(known, most)
-
-
-def _own_count(connection: Connection, own: Own, table: Table) -> int:
-    query = select(func.count()).select_from(table).where(own.rows(table))
-    return connection.execute(query).scalar_one()
 
 
 def _count(connection: Connection, rows: Select[Any]) -> int:

@@ -18,7 +18,9 @@ from sqlalchemy import Connection, MetaData, Table, func, insert, select, text
 
 from engram.errors import MapCorruptError, MapError, MapLockedError
 from engram.files import WriterLock, draft_folder
+from engram.maps.changes import Changes
 from engram.maps.content import EMPTY_HASH, Identities, chained
+from engram.maps.counting import count_on
 from engram.maps.map_files import log_problems
 from engram.maps.rows import Row, sealed, to_json, verified
 from engram.maps.runs import Runs, save_runs
@@ -32,7 +34,7 @@ from engram.maps.schema import (
     runs,
 )
 from engram.maps.sqlite import MAP_FILE, keep_log, write_format
-from engram.maps.totals import Own, Totals, count_all, count_on
+from engram.maps.totals import Own, Totals
 from engram.maps.view import LARGEST_KEY, View
 from engram.sqlite import SqliteFile, is_full
 
@@ -192,11 +194,16 @@ def complete_history(connection: Connection) -> int:
     committed = [row for row in rows if row["number"] is not None]
     for row in rows:
         row["ranges"] = to_json(_ranges_of(row, ranges))
+    _put(connection, rows)  # by which the rest finds the rows of each revision
     _count(connection, committed, ranges)
+    _put(connection, committed)
+    return len(committed)
+
+
+def _put(connection: Connection, rows: list[Row]) -> None:
     for row in rows:
         sealed(revisions, row)
         connection.execute(revisions.update().where(revisions.c.key == row["key"]).values(row))
-    return len(committed)
 
 
 def _old_rows(connection: Connection) -> list[Row]:
@@ -237,8 +244,8 @@ def _count(connection: Connection, rows: list[Row], ranges: Ranges) -> None:
     for row in rows:
         own = Own(row["key"], ranges.get(row["key"], {}))
         before, now = View(row["number"] - 1), View(row["number"])
-        counted = count_on(connection, before, totals, held, own) or count_all(connection, now)
-        totals, held = counted
+        changes = Changes.between(connection, before, now)
+        totals, held = count_on(connection, now, totals, held, changes)
         chain = chained(connection, chain, row, own, known)
         row |= {"totals": totals.to_json(), "chain": chain}
     save_runs(connection, None, held)

@@ -457,23 +457,23 @@ def plot_map(path: Path, out: Path, by: str = "experience", at: int | str | None
 
 def draw_difference(map_path: Path, difference: MapDifference, path: Path) -> None:
     """Draws the unchanged, added and removed parts between two revisions, in the map frame."""
-    graph = difference.graph
-    points = np.zeros((len(graph), 2))
-    for revision in (difference.before, difference.after):  # a node that moved is where it is now
+    drawn = []
+    for revision, changed in (
+        (difference.after, difference.added),
+        (difference.before, difference.removed),
+    ):
         with Map.open(map_path, at=revision) as opened:
-            at = [graph.index(node.id) for node in opened.graph.nodes]
-            points[at] = opened.frame.positions[:, :2]
-    old = np.zeros(len(graph), bool)
-    new = np.zeros(len(graph), bool)
-    old[[graph.index(node.id) for node in difference.old.nodes]] = True
-    new[[graph.index(node.id) for node in difference.new.nodes]] = True
+            points = opened.frame.positions[:, :2]
+            mask = np.array([node.id in changed for node in opened.graph.nodes], bool)
+        drawn += [points[~mask], points[mask]]
+    kept, added, _, removed = drawn
     tracks = [
-        Track(f"{label}: {counted(int(mask.sum()), 'node')}", points[mask], colour)
-        for label, mask, colour in (
-            ("in both", old & new, "0.6"),
-            ("added", new & ~old, "tab:green"),
-            ("removed", old & ~new, "tab:red"),
+        Track(f"{label}: {counted(len(points), 'node')}", points, colour)
+        for label, points, colour in (
+            ("in both", kept, "0.6"),
+            ("added", added, "tab:green"),
+            ("removed", removed, "tab:red"),
         )
-        if mask.any()
+        if len(points)
     ]
     draw_from_above(tracks, path, f"Revision {difference.before} → {difference.after}")

@@ -25,11 +25,12 @@ from engram.fleet.download.coverage import Coverage, Demand, greedy_order
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Mask, Stock
 from engram.graph.model import PathId, path_id
-from engram.maps.difference import edge_lengths
 
 MINUTES_PER_DAY = 1440.0
 # Minutes (60 µs): rounding may put a stamp on a boundary just before it.
 _ROUNDING_MIN = 1e-6
+# Least length of an edge, metres, so that nodes at one place are still a step apart.
+_LEAST_STEP_M = 1e-3
 
 Array = NDArray[np.float64]
 
@@ -455,9 +456,9 @@ def within(stock: Stock, seeds: NDArray[np.int64], radius_m: float) -> Mask:
     """(N,) bool, the nodes within a distance of any seed, along the edges."""
     from scipy.sparse.csgraph import dijkstra
 
-    distance_m = dijkstra(
-        edge_lengths(stock.graph), directed=False, indices=seeds, min_only=True, limit=radius_m
-    )
+    links = stock.graph.lightest(lambda edge: max(edge.a_from_b.distance_m, _LEAST_STEP_M))
+    lengths_m = links.matrix(len(stock.graph))
+    distance_m = dijkstra(lengths_m, directed=False, indices=seeds, min_only=True, limit=radius_m)
     return np.asarray(np.isfinite(distance_m), np.bool_)
 
 
