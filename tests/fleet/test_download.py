@@ -162,12 +162,12 @@ def test_words_go_along_and_make_no_difference_to_the_bytes(centre, tmp_path):
     with Map.open(keeping, writes=True) as store:
         nodes = [node.id for node in store.load().nodes]
         words = NodeWords.of_map(store, vocabulary)
-        assert not words.kept
+        assert not words.stored(nodes)
         words.keep_missing(nodes)
-        kept = NodeWords.of_map(store, vocabulary).kept
+        kept = words.stored(nodes)
     sent(keeping, tmp_path / "after.engram", "tod", depart_h=9.0)
     with Map.open(tmp_path / "after.engram") as store:
-        went = NodeWords.of_map(store, vocabulary).kept
+        went = NodeWords.of_map(store, vocabulary).stored(nodes)
     assert set(went) == node_ids(tmp_path / "after.engram")
     assert all(np.array_equal(words, kept[node]) for node, words in went.items())
     assert (tmp_path / "before.engram").read_bytes() == (tmp_path / "after.engram").read_bytes()

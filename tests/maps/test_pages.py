@@ -12,17 +12,27 @@ import pytest
 from engram.frontend.frame import BRIEF
 from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
-from engram.graph.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, Removal, path_id
+from engram.graph.model import (
+    Edge,
+    EdgeKind,
+    Goal,
+    Node,
+    PathEntry,
+    PathEntryKind,
+    Removal,
+    path_id,
+)
 from engram.graph.neighbourhood import Search
 from engram.graph.pages import PagedGraph
 from engram.graph.paths import Attempts, PathMemory
 from engram.localiser.settings import LocaliserConfig
 from engram.maps.map import Map
+from engram.maps.map_frame import moves
 from engram.maps.writer import RevisionWriter
 from engram.robot.localisers import _by_pages, _whole
 
 from .frames import CAMERA, FRONTEND, frame
-from .maps import attempt, node, session
+from .maps import assert_same_edges, attempt, node, session
 
 _SIGMA = np.diag([0.05**2] * 3 + [0.01**2] * 3)
 _VAGUE = 400 * _SIGMA
@@ -244,3 +254,52 @@ def test_what_is_added_stays(town: Path) -> None:
 
 def _changed(one: Edge) -> Edge:
     return Edge(one.a, one.b, one.kind, SE3(np.eye(3), np.array([0.0, 0.0, 0.5])), _SIGMA)
+
+
+def test_lookups_find_what_the_whole_map_has(opened: Map) -> None:
+    found, every = opened.load(), opened.lookups
+    with Map.open(opened.location, at=4) as all_drives:
+        some = [one.id for one in all_drives.load().nodes]
+    held = every.nodes(some)
+    assert [held[one.id].node for one in found.nodes] == list(found.nodes)
+    assert len(held) == len(found.nodes)
+    hashes = {one: there.landmark_hash for one, there in held.items()}
+    assert hashes == opened.landmark_hashes == every.landmark_hashes(some)
+    for path in opened.path_memory.paths:
+        assert every.entries(path) == list(opened.path_memory.entries(path))
+    picked = {one.id for one in found.nodes[10:20]}
+    expected = [one for one in found.edges if picked & {one.a, one.b}]
+    assert_same_edges(
+        sorted(every.edges(picked), key=_key),
+        sorted(expected, key=_key),
+    )
+
+
+def test_lookups_find_attempts_and_last_nodes_of_sessions(opened: Map) -> None:
+    some = list(opened.sessions)
+    made, keys = opened.attempts, {one.id: at for at, one in enumerate(opened.graph.nodes)}
+    index = {there.key: keys[one] for one, there in opened.lookups.nodes(list(keys)).items()}
+    ours = opened.lookups.attempts(some)
+    order = np.argsort(made.session, kind="stable")
+    for name in ("session", "iteration", "along_m", "accepted", "rank"):
+        assert np.array_equal(getattr(ours, name), getattr(made, name)[order])
+    for name in ("reference", "node"):
+        assert [index[key] for key in getattr(ours, name).tolist()] == getattr(made, name)[
+            order
+        ].tolist()
+    last = {one.session: one.stamp_ns for one in opened.graph.nodes}
+    assert opened.lookups.last_stamps_ns() == last
+
+
+def test_lookups_say_what_a_revision_moved(town: Path) -> None:
+    with Map.open(town, at=1) as before, Map.open(town, at=3) as after:
+        was, now = before.placements, after.placements
+        goals = [Goal("dock", next(iter(was)), SE3.identity())]
+        with Map.open(town, at=2) as between:
+            known = between.placements
+        assert after.lookups.moves(3, goals) == moves(known, now, goals)
+        assert before.lookups.moves(1, []) == moves({}, was, [])
+
+
+def _key(edge: Edge) -> tuple[object, object, EdgeKind]:
+    return edge.a, edge.b, edge.kind

@@ -62,8 +62,9 @@ def test_words_are_worked_out_once(path: Path) -> None:
 def test_they_are_those_of_the_landmarks(path: Path) -> None:
     fill(path)
     with Map.open(path) as store:
-        kept = NodeWords.of_map(store, VOCABULARY).kept
-        for node in store.load().nodes:
+        nodes = store.load().nodes
+        kept = NodeWords.of_map(store, VOCABULARY).stored([node.id for node in nodes])
+        for node in nodes:
             frame = store.frames.frame(node.id)
             assert (
                 kept[node.id].tolist()
@@ -100,7 +101,7 @@ def test_mapping_keeps_the_words_of_what_it_saves_and_of_what_was_there(
     with Map.open(path) as store:
         nodes = {node.id for node in store.load().nodes}
         assert len(nodes) >= before + 10
-        assert NodeWords.of_map(store, VOCABULARY).kept.keys() == nodes
+        assert NodeWords.of_map(store, VOCABULARY).stored(list(nodes)).keys() == nodes
 
 
 def test_training_and_taking_a_vocabulary_fill_in_words(path: Path, tmp_path: Path) -> None:
@@ -121,7 +122,9 @@ def test_training_and_taking_a_vocabulary_fill_in_words(path: Path, tmp_path: Pa
     for one in (path, other):
         with Map.open(one) as opened:
             assert opened.vocabulary is not None
-            assert len(NodeWords.of_map(opened, vocabulary_of(opened)).kept) == count_nodes(one)
+            nodes = [node.id for node in opened.load().nodes]
+            stored = NodeWords.of_map(opened, vocabulary_of(opened)).stored(nodes)
+            assert len(stored) == len(nodes) == count_nodes(one)
     again = use_vocabulary(other, path, author="a", monitor=Heard())
     assert again.revision is None
 

@@ -10,7 +10,7 @@ hash. A missing or damaged row only costs the time to compute it again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
@@ -21,7 +21,7 @@ from sqlalchemy import Connection, bindparam, select
 from engram.errors import InputError, MapCorruptError
 from engram.graph.model import NodeId
 from engram.graph.paths import Attempts
-from engram.maps.rows import Row, node_from_bytes, sealed, verified
+from engram.maps.rows import Row, sealed, verified
 from engram.maps.schema import nodes, words
 from engram.maps.sqlite import SqliteDatabase, upsert
 
@@ -244,23 +244,17 @@ def load_words_between(
     return found
 
 
-def load_words(connection: Connection, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
-    """Words (n,) of each node by the vocabulary of this hash (16 bytes), without damaged rows."""
-    query = _WORDS.where(words.c.vocabulary == vocabulary).order_by(words.c.node)
+def load_words(
+    database: SqliteDatabase, vocabulary: bytes, some: Sequence[NodeId]
+) -> dict[NodeId, NDArray[np.int32]]:
+    """Words (n,) of some nodes by the vocabulary of this hash, without damaged rows."""
     found = {}
-    for row in connection.execute(query):
-        sound = _sound_words(row)
+    for node in some:
+        row = database.first(_WORDS_OF_NODE, {"uuid": node.bytes, "vocabulary": vocabulary})
+        sound = None if row is None else _sound_words(row)
         if sound is not None:
-            found[node_from_bytes(row[-1])] = sound
+            found[node] = sound
     return found
-
-
-def words_of_node(
-    database: SqliteDatabase, node: NodeId, vocabulary: bytes
-) -> NDArray[np.int32] | None:
-    """The words (n,) of a node by the vocabulary of this hash; None without sound ones."""
-    row = database.first(_WORDS_OF_NODE, {"uuid": node.bytes, "vocabulary": vocabulary})
-    return None if row is None else _sound_words(row)
 
 
 def _sound_words(row: Sequence[Any]) -> NDArray[np.int32] | None:

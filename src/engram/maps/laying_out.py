@@ -7,21 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 from sqlalchemy import Connection, select
 
-from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, Node, NodeId, Placement
 from engram.graph.placing import PlacingConfig, Surroundings, place
+from engram.maps.lookups import node_records, places_of
 from engram.maps.map_frame import changed, graph_of
-from engram.maps.reading import load_cameras
-from engram.maps.rows import (
-    Row,
-    edges_from_rows,
-    node_from_row,
-    session_from_row,
-    transform_from_bytes,
-    verified,
-)
+from engram.maps.rows import Row, edges_from_rows, verified
 from engram.maps.runs import Keys, Runs
-from engram.maps.schema import edges, nodes, placements, sessions
+from engram.maps.schema import edges, nodes
 from engram.maps.totals import Own, Totals, state_at_head, supersedes
 from engram.maps.view import View, few, places_in_history
 
@@ -63,10 +55,10 @@ def new_places(
     if not len(new):
         return []
     known = _older(connection, view, old)
-    placed = _places(connection, view, [row["key"] for row in known])
+    placed = places_of(connection, view, [row["key"] for row in known])
     if (runs.find(old) < 0).any() or len(placed) < len(old):
         return None
-    records = _nodes(connection, [*known, *fresh])
+    records = node_records(connection, [*known, *fresh])
     by_key = dict(zip((row["key"] for row in (*known, *fresh)), records, strict=True))
     graph = graph_of(records, _edges(joins, by_key))
     before = {by_key[key].id: pose for key, pose in placed.items()}
@@ -100,26 +92,6 @@ def _older(connection: Connection, view: View, keys: Keys) -> list[Row]:
         found += verified(nodes, connection.execute(query))
     place_of = places_in_history(connection)
     return sorted(found, key=lambda row: (place_of[row["revision"]], row["key"]))
-
-
-def _places(connection: Connection, view: View, keys: list[int]) -> dict[int, SE3]:
-    """The newest place of each node that has one."""
-    found = {}
-    for part in few(keys):
-        query = view.select(placements).where(placements.c.node.in_(part))
-        for row in verified(placements, connection.execute(query)):
-            found[row["node"]] = transform_from_bytes(row["map_from_node"], "a placement")
-    return found
-
-
-def _nodes(connection: Connection, rows: list[Row]) -> list[Node]:
-    cameras = load_cameras(connection)
-    drives = {}
-    for part in few(sorted({row["session"] for row in rows})):
-        query = select(sessions).where(sessions.c.key.in_(part))
-        for row in verified(sessions, connection.execute(query.order_by(sessions.c.key))):
-            drives[row["key"]] = session_from_row(row, cameras[row["camera"]].id).id
-    return [node_from_row(row, drives[row["session"]], cameras[row["camera"]].id) for row in rows]
 
 
 def _edges(rows: list[Row], nodes_by_key: Mapping[int, Node]) -> tuple[Edge, ...]:

@@ -41,7 +41,6 @@ from engram.maps import marks, reading
 from engram.maps.attempts import (
     load_words,
     load_words_between,
-    words_of_node,
     words_row,
     write_words,
 )
@@ -51,6 +50,7 @@ from engram.maps.difference import STRETCH_M, MapDifference, difference
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
 from engram.maps.hiding import Reverted, compare, hide_revision
 from engram.maps.laying_out import new_places
+from engram.maps.lookups import Lookups
 from engram.maps.map_frame import MapFrame, all_places, frame_of, graph_of
 from engram.maps.origins import Origin, origin_of
 from engram.maps.pages import MapPages
@@ -361,6 +361,11 @@ class Map:
         return self.derived(_pages_of, self.revision)
 
     @property
+    def lookups(self) -> Lookups:
+        """What it has of given nodes, paths and sessions, without reading it whole."""
+        return Lookups(self._database, self._view)
+
+    @property
     def path_memory(self) -> PathMemory:
         """Its paths."""
         return self._read_contents().path_memory
@@ -448,17 +453,12 @@ class Map:
         with self._database.reading() as connection:
             return reading.known_among(connection, self._view, some)
 
-    def words(self, vocabulary: bytes) -> Mapping[NodeId, NDArray[np.int32]]:
-        """The stored words (n,) of nodes by the vocabulary of this hash, rising.
+    def words(self, vocabulary: bytes, some: Sequence[NodeId]) -> dict[NodeId, NDArray[np.int32]]:
+        """The stored words (n,) of some nodes by the vocabulary of this hash, rising.
 
         Damaged rows are left out: words can be computed again from the landmarks.
         """
-        with self._database.reading() as connection:
-            return load_words(connection, vocabulary)
-
-    def words_of(self, node: NodeId, vocabulary: bytes) -> NDArray[np.int32] | None:
-        """The stored words (n,) of a node, as `words`; None without sound ones."""
-        return words_of_node(self._database, node, vocabulary)
+        return load_words(self._database, vocabulary, some)
 
     def words_between(
         self, vocabulary: bytes, first: int, last: int

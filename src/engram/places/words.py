@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from threading import Lock
 
@@ -111,17 +112,12 @@ class NodeWords:
         """Hash of the vocabulary, its key in maps."""
         return hash_of(self.vocabulary)
 
-    @cached_property
-    def kept(self) -> Mapping[NodeId, Words]:
-        """The valid words that the map stores for this vocabulary."""
+    def stored(self, nodes: Sequence[NodeId]) -> dict[NodeId, Words]:
+        """The valid words (n,) int32 of nodes that the map stores for this vocabulary."""
         if self._store is None:
             return {}
-        kept = self._store.words(self.hash)
-        return {node: words for node, words in kept.items() if self._fit(words)}
-
-    def _stored(self, node: NodeId) -> Words | None:
-        words = None if self._store is None else self._store.words_of(node, self.hash)
-        return words if words is not None and self._fit(words) else None
+        found = self._store.words(self.hash, nodes)
+        return {node: words for node, words in found.items() if self._fit(words)}
 
     def _fit(self, words: Words) -> bool:
         return not len(words) or int(words[-1]) < len(self.vocabulary)
@@ -148,35 +144,42 @@ class NodeWords:
 
         ``engram check`` reports such a node, and reading its landmarks raises.
         """
-        if "kept" in self.__dict__ and (words := self.kept.get(node)) is not None:
-            return words
         if node not in self._known:
-            words = self._stored(node)
+            words = self.stored([node]).get(node)
             self._known[node] = self._work_out(node) if words is None else words
         return self._known[node]
 
-    def keep_missing(self, nodes: Sequence[NodeId], monitor: Monitor = QUIET) -> int:
+    def keep_missing(
+        self,
+        nodes: Sequence[NodeId],
+        monitor: Monitor = QUIET,
+        *,
+        brought: NodeWords | None = None,
+    ) -> int:
         """Computes the missing words of nodes and stores them in the map.
 
         Damaged nodes are left out. If stopped early, the progress is kept.
 
         Args:
             monitor: receives the stage `words`, one item per node.
+            brought: words by the same vocabulary that another map stores, which are taken over.
 
         Returns:
-            Number of nodes whose words were computed.
+            Number of nodes whose words were stored.
         """
         assert self._store is not None
-        missing = [node for node in nodes if node not in self.kept]
         count = 0
-        with monitor.stage("words", len(missing)) as stage:
-            for first in range(0, len(missing), _BATCH):
-                found = {}
-                for node in missing[first : first + _BATCH]:
-                    words = self._work_out(node)
-                    if words is not None:
-                        found[node] = words
+        with monitor.stage("words", len(nodes)) as stage:
+            for part in (nodes[at : at + _BATCH] for at in range(0, len(nodes), _BATCH)):
+                known = self.stored(part)
+                found = {} if brought is None else dict(brought.stored(part))
+                for node in part:
+                    if node not in known and node not in found:
+                        words = self._work_out(node)
+                        if words is not None:
+                            found[node] = words
                     stage.advance()
+                found = {node: words for node, words in found.items() if node not in known}
                 if found:
                     self._store.put_words(self.hash, found)
                     count += len(found)
@@ -194,7 +197,11 @@ class NodeWords:
             for number in range(first, due):
                 at = number * PLACES_PER_BLOCK
                 known = self.of_keys(at + 1, at + PLACES_PER_BLOCK)
-                shown = [known.get(at + 1 + place) for place in range(PLACES_PER_BLOCK)]
+                nodes = islice(store.pages.ids(at), PLACES_PER_BLOCK)
+                shown = [
+                    known.get(key) if node is None or key in known else self._work_out(node)
+                    for key, node in enumerate(nodes, at + 1)
+                ]
                 for words in shown:
                     recogniser.add(np.zeros(0, np.int32) if words is None else words)
                 unreadable = [place for place, words in enumerate(shown) if words is None]

@@ -629,10 +629,15 @@ def remove_goal(path: Path, name: str, *, author: str) -> dict[str, Any]:
             return {"name": name, "revision": writer.commit().number}
 
 
-def had_goal(store: Map, goal: Goal) -> bool:
-    """Whether a map ever had a goal of this name at this place, at nodes that it has."""
-    graph = store.graph
-    for one in store.seen_goals:
+def had_goal(seen: Iterable[Goal], graph: ExperienceGraph, goal: Goal) -> bool:
+    """Whether a map ever had a goal of this name at this place, at nodes that it has.
+
+    Args:
+        seen: `Map.seen_goals`.
+        graph: the map's.
+        goal: the goal.
+    """
+    for one in seen:
         if one.name != goal.name or one.node not in graph or goal.node not in graph:
             continue
         way = graph.predict(graph.index(one.node), graph.index(goal.node))

@@ -369,7 +369,7 @@ _READERS: tuple[Callable[[Map], object], ...] = (
     lambda store: store.anchors,
     lambda store: store.removals,
     lambda store: store.statistics(),
-    lambda store: store.words(bytes(16)),
+    lambda store: store.words(bytes(16), [one.id for one in store.load().nodes]),
     lambda store: store.omissions,
     lambda store: store.interrupted(),
     lambda store: store.blob_sizes,

@@ -548,7 +548,9 @@ def lacking_marks(part: Part, own: Map) -> list[Mark]:
         if {removal.a, removal.b} <= sent and removal.key not in own.seen_removals
     ]
     lacking += [
-        goal for goal in _goals(part) if goal.name not in own.goals and not had_goal(own, goal)
+        goal
+        for goal in _goals(part)
+        if goal.name not in own.goals and not had_goal(own.seen_goals, own.graph, goal)
     ]
     if _one_frame(own.placements, store.placements):
         lacking += [

@@ -31,11 +31,10 @@ from engram.fleet.merge.open_merge import (
 from engram.fleet.merge.replay import Replay, Segment, string_segments
 from engram.fleet.merge.report import MergeReport, picture_before_and_after
 from engram.frontend.frame import DescriptorKind
-from engram.graph.model import Node, PathEntry, Session, SessionId, path_id
+from engram.graph.model import Node, NodeId, PathEntry, Session, SessionId, path_id
 from engram.graph.paths import Attempts
 from engram.maps.map import Map
 from engram.maps.map_files import copy_map, publish_map
-from engram.maps.map_frame import moves
 from engram.monitor import QUIET, Monitor, interruptible
 from engram.places.recognisers import recogniser_names
 from engram.places.words import NodeWords, vocabulary_or_default
@@ -94,7 +93,7 @@ def merge_one(
     """
     merge = Merge(centre, robot)
     check_fits(merge)
-    report, before = merge.report, len(merge.graph)
+    report, was_empty = merge.report, centre.node_count() == 0
     report.notes = notes(merge, time.time_ns())
     nodes = robot.graph.nodes
     new = [node for node in nodes if not merge.knows(node.id)]
@@ -103,7 +102,7 @@ def merge_one(
     report.changed = bool(new) or merge.has_more()
     if report.changed:
         check_readable(robot, new)
-        places, goals = centre.placements, list(centre.goals.values())
+        goals = list(centre.goals.values())
         with centre.begin_revision(**_about(merge, new, settings, options)) as merge.writer:
             with monitor.stage(f"merge {robot.location}", len(new)) as stage:
                 _take_over(merge, new, Replay(merge, settings, options, stage))
@@ -113,10 +112,12 @@ def merge_one(
                 gates.check(merge, monitor)
                 monitor.check()
             report.revision = merge.writer.commit(settings.placing).number
-        report.moved = moves(places, centre.placements, goals)
+        report.moved = centre.lookups.moves(report.revision, goals)
         if options.relocaliser in recogniser_names():  # these use the nodes' visual words
             _keep_words(merge, settings.frontend.descriptor)
-    _say_what_hangs_together(merge, before)
+    report.components = centre.totals().components
+    if not was_empty:
+        _say_what_is_apart(merge)
     report.content_hash = centre.content_hash()
     return report
 
@@ -172,7 +173,8 @@ def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
     for amendment in merge.robot.amendments:
         merge.writer.add_amendment(amendment)
     merge.add_entries(late)
-    _see_edges_again(merge)
+    if merge.writer.shows_again:
+        merge.see_edges_again()
     for edge in filter(merge.lacks_edge, merge.edges):
         merge.add_edge(edge)  # the robot's new edges between known nodes
     _join_components(merge)
@@ -210,35 +212,39 @@ def _unite_path(merge: Merge, session: Session, replay: Replay) -> list[PathEntr
     """Adds the drive's path as far as its nodes are known; returns the other entries."""
     entries = merge.robot.path_memory.entries(path_id(session.id))
     merge.add_entries([entry for entry in entries if merge.knows(entry.node)])
-    merge.add_entries(replay.entries.get(session.id, []))
+    merge.add_replayed(replay.entries.get(session.id, []))
     return [entry for entry in entries if not merge.knows(entry.node)]
-
-
-def _see_edges_again(merge: Merge) -> None:
-    """Adds the edges of nodes that a revert had hidden and this merge shows again."""
-    if not merge.writer.shows_again:
-        return
-    merge.writer.checkpoint()
-    graph, edges = merge.graph, merge.centre.load().edges
-    graph.add_edges([edge for edge in edges if graph.find_edge(edge.a, edge.b, edge.kind) is None])
 
 
 def _join_components(merge: Merge) -> None:
     """Joins components of the fleet map that only omitted nodes connect."""
     from scipy.cluster.hierarchy import DisjointSet
 
-    labels, index = merge.graph.components(), merge.graph.index
     edges = []
     for edge in merge.edges:
         a, b = merge.equivalent(edge.a), merge.equivalent(edge.b)
         moved = None if a is None or b is None else recomposed(edge, a, b)
-        if moved is not None and labels[index(moved.a)] != labels[index(moved.b)]:
+        if moved is not None:
             edges.append(moved)
     edges.sort(key=lambda edge: (uncertainty_m2(edge.covariance), edge.a, edge.b))
-    joined = DisjointSet(labels.tolist())
+    ends = {end for pair in merge.joined for end in pair}
+    ends |= {end for edge in edges for end in (edge.a, edge.b)}
+    part = _parts_before(merge, ends)
+    joined: DisjointSet = DisjointSet(part.values())
+    for a_end, b_end in merge.joined:
+        joined.merge(part[a_end], part[b_end])
     for edge in edges:
-        if joined.merge(int(labels[index(edge.a)]), int(labels[index(edge.b)])):
+        if joined.merge(part[edge.a], part[edge.b]):
             merge.add_edge(edge)
+
+
+def _parts_before(merge: Merge, nodes: set[NodeId]) -> dict[NodeId, NodeId | int]:
+    """The component of each node before this merge; of one taken since, the node itself."""
+    part: dict[NodeId, NodeId | int] = {node: node for node in nodes}
+    held = merge.centre.lookups.nodes(nodes - merge.taken)
+    keys = np.array([one.key for one in held.values()], np.int64)
+    components = merge.runs.component[merge.runs.find(keys)].tolist()
+    return part | dict(zip(held, components, strict=True))
 
 
 def _carry_omissions(merge: Merge) -> None:
@@ -252,13 +258,9 @@ def _carry_omissions(merge: Merge) -> None:
 
 def _carry_attempts(merge: Merge, replay: Replay) -> None:
     """Copies remembered attempts (method §7.4), and those of the replay."""
-    sessions, remembered = list(merge.centre.sessions), merge.centre.attempts
     if merge.writer.shows_again:
-        # A node that is shown again brings back its remembered attempts.
-        merge.writer.checkpoint()
-        now = merge.centre.load()
-        sessions, remembered = [session.id for session in now.sessions], now.attempts
-    new = merge.new_attempts(sessions, remembered)
+        merge.writer.checkpoint()  # a node that is shown again brings back its attempts
+    new = merge.new_attempts()
     merge.report.attempts += len(new)
     ids = [
         node.id if at is None else at.node
@@ -278,32 +280,23 @@ def _keep_words(merge: Merge, descriptor: DescriptorKind) -> None:
 
     Words belong to no revision: if this is interrupted, they are computed later.
     """
-    vocabulary, graph = vocabulary_or_default(merge.centre, descriptor), merge.graph
+    vocabulary = vocabulary_or_default(merge.centre, descriptor)
+    nodes = [node.id for node in merge.robot.graph.nodes if merge.has(node.id)]
     theirs = NodeWords.of_map(merge.robot, vocabulary)
-    robot = merge.robot.graph  # nodes hidden there were not checked
-    brought = {
-        node: words for node, words in theirs.kept.items() if node in graph and node in robot
-    }
-    if brought:
-        merge.centre.put_words(theirs.hash, brought)
-    NodeWords.of_map(merge.centre, vocabulary).keep_missing([node.id for node in graph.nodes])
+    NodeWords.of_map(merge.centre, vocabulary).keep_missing(nodes, brought=theirs)
 
 
-def _say_what_hangs_together(merge: Merge, before: int) -> None:
-    """Counts the components of the fleet map; notes added nodes that are not connected to it."""
-    report, labels = merge.report, merge.graph.components()
-    report.components = int(labels.max(initial=-1)) + 1
-    if not (report.taken and before):
-        return
-    apart = ~np.isin(labels[before:], labels[:before])
-    if apart.all() and not report.known:
+def _say_what_is_apart(merge: Merge) -> None:
+    """Notes added nodes that are not connected to the earlier fleet map."""
+    report, apart = merge.report, sum(map(merge.is_apart, merge.taken))
+    if apart and apart == len(merge.taken) and not report.known:
         report.notes.append(
             "none of its nodes matched the fleet map: it shows another area, or this one in "
             "other conditions"
         )
-    elif apart.any():
+    elif apart:
         report.notes.append(
-            f"not connected to the existing map: {counted(int(apart.sum()), 'added node')}; no "
+            f"not connected to the existing map: {counted(apart, 'added node')}; no "
             "match links them to it, or odometry failed in between"
         )
 
@@ -348,8 +341,8 @@ def merge(
         ConfigError: a drive is not held out. Nothing was merged.
         IncompatibleError: a map does not fit the fleet map.
         RefusedError: held-out drives localise worse in the result, or it has new wrong edges.
-        MapError: a map cannot be read or written. If a map cannot be opened or its records are
-            damaged, nothing was merged; otherwise earlier merges are kept.
+        MapError: a map cannot be read or written. If one cannot be opened, nothing was merged;
+            otherwise earlier merges are kept.
         KeyboardInterrupt: Ctrl-C came before the first merge or after the last one, so there was
             none to undo.
     """
@@ -390,7 +383,7 @@ def _check_given(centre: Path, robots: Sequence[Path], gate: Gate | None) -> Non
         with Map.open(robot) as store:
             if centre.exists() and robot.samefile(centre):
                 raise InputError(f"{robot} is the fleet map itself; name other maps to merge")
-            sessions = store.load().sessions
+            sessions = list(store.sessions.values())
         if gate is not None:
             gate.check_held_out(sessions, robot)
     if gate is not None and centre.exists():

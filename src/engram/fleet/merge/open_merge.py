@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Container, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeAlias
@@ -17,6 +17,7 @@ from engram.errors import IncompatibleError
 from engram.fleet.merge.report import MergeReport
 from engram.frontend.frame import Frame
 from engram.geometry.se3 import SE3, propagate_covariance
+from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
     Clock,
     Edge,
@@ -39,6 +40,7 @@ from engram.maps.map import Map
 from engram.maps.records import StoredNode
 from engram.maps.writer import RevisionWriter
 from engram.robot.anchors import had_goal
+from engram.robot.localisers import graph_in
 
 if TYPE_CHECKING:
     from scipy.cluster.hierarchy import DisjointSet
@@ -119,10 +121,13 @@ class Merge:
 
     Attributes:
         centre: the fleet map; its graph and path memory grow.
-        graph: the fleet map's.
+        held: those of the robot's nodes that the fleet map had before.
+        runs: which nodes of the fleet map were connected before.
         robot: the robot's map.
         sessions: of the robot's map, in the order of their starts.
         edges: of the robot's map, by their keys.
+        taken: nodes taken in this merge.
+        joined: the ends of edges that were added in this merge.
         writer: the open revision; set before the first addition.
     """
 
@@ -132,35 +137,45 @@ class Merge:
         from scipy.cluster.hierarchy import DisjointSet
 
         self.centre = centre
-        self.graph = centre.graph
         self.robot = robot
         self.sessions = sorted(
             robot.sessions.values(), key=lambda session: (session.start_ns, session.id)
         )
         self.edges = sorted(robot.graph.edges, key=_edge_key)
         self.report = MergeReport.of(robot)
-        self._omitted = {
-            omission.omitted: position_of(omission) for omission in centre.omissions.values()
-        }
-        self._entries: dict[PathId, set[_EntryKey]] = {}
+        own = [*(node.id for node in robot.graph.nodes), *robot.omissions]
+        self.held = centre.lookups.nodes(own)
+        self.runs = centre.lookups.runs()
+        self.taken: set[NodeId] = set()
+        self.joined: list[tuple[NodeId, NodeId]] = []
+        known = centre.lookups.omissions(own)
+        self._omitted = {node: position_of(omission) for node, omission in known.items()}
+        self._entries: dict[PathId, _KnownEntries] = {}
         # Components of the taken nodes: a graph search for each would be too slow.
         self._parts: DisjointSet = DisjointSet([_CENTRE])
 
+    @cached_property
+    def graph(self) -> ExperienceGraph:
+        """The fleet map's, in which segments are replayed; it grows."""
+        return graph_in(self.centre, saves=True)
+
     # -- known records
+
+    def has(self, node: NodeId) -> bool:
+        """Whether the fleet map has the robot's node, perhaps since this merge."""
+        return node in self.held or node in self.taken
 
     def has_omitted(self, node: NodeId) -> bool:
         """Whether an earlier merge omitted the node."""
-        return node in self._omitted and node not in self.graph
+        return node in self._omitted and not self.has(node)
 
     def knows(self, node: NodeId) -> bool:
         """Whether the node was taken or omitted before."""
-        return node in self.graph or node in self._omitted
+        return self.has(node) or node in self._omitted
 
     def equivalent(self, node: NodeId) -> Position | None:
         """Position of the node's camera in the fleet map: at itself or its equivalent."""
-        if node in self.graph:
-            return Position.at(node)
-        return self._omitted.get(node)
+        return Position.at(node) if self.has(node) else self._omitted.get(node)
 
     def is_apart(self, node: NodeId) -> bool:
         """Whether a node taken in this merge is not connected to the earlier fleet map."""
@@ -175,24 +190,24 @@ class Merge:
 
     def has_more(self) -> bool:
         """Whether a map without new nodes has other new records."""
-        known, paths = self.centre.sessions, self.robot.path_memory
+        paths = self.robot.path_memory
         return (
-            any(session not in known for session in self.robot.sessions)
+            any(session not in self.centre.sessions for session in self.robot.sessions)
             or any(self.new_entry(entry) for path in paths.paths for entry in paths.entries(path))
             or any(map(self.lacks_edge, self.edges))
             or any(map(self.lacks_omission, self.robot.omissions))
             or not set(self.robot.amendments) <= set(self.centre.amendments)
             or any(self.new_removals())
             or any(self.new_goals())
-            or len(self.new_attempts(known, self.centre.attempts)) > 0
+            or len(self.new_attempts()) > 0
         )
 
     def lacks_edge(self, edge: Edge) -> bool:
         """Whether this edge is missing between two nodes of the fleet map; False for bridges."""
         return (
             edge.kind is not EdgeKind.BRIDGE
-            and edge.a in self.graph
-            and edge.b in self.graph
+            and self.has(edge.a)
+            and self.has(edge.b)
             and self.graph.find_edge(edge.a, edge.b, edge.kind) is None
             and edge not in self.removed
         )
@@ -205,7 +220,7 @@ class Merge:
     def new_removals(self) -> Iterator[Removal]:
         """The robot's removals between nodes of the fleet map that it has never had."""
         for removal in self.robot.removals:
-            known = removal.a in self.graph and removal.b in self.graph
+            known = self.has(removal.a) and self.has(removal.b)
             if known and removal.key not in self.centre.seen_removals:
                 yield removal
 
@@ -219,7 +234,7 @@ class Merge:
             if position is not None and goal.name not in self.centre.goals:
                 node_from_goal = position.node_from_live @ goal.node_from_goal
                 moved = Goal(goal.name, position.node, node_from_goal)
-                if not had_goal(self.centre, moved):
+                if not had_goal(self.centre.seen_goals, self.graph, moved):
                     yield moved
 
     def lacks_omission(self, omitted: NodeId) -> Position | None:
@@ -241,38 +256,30 @@ class Merge:
             is not known.
         """
         position = self.equivalent(entry.node)
-        if position is None:
-            return None
-        new = replace(entry, node=position.node)
-        if _key(new) in self._known_entries(entry.path):
+        return None if position is None else self._numbered(replace(entry, node=position.node))
+
+    def _numbered(self, entry: PathEntry) -> PathEntry | None:
+        """An entry at a node of the fleet map; None if the path has it."""
+        known = self._known_entries(entry.path)
+        if _key(entry) in known.keys:
             return None
         if entry.kind is PathEntryKind.REPLAYED:
-            last = [
-                previous.sequence + 1
-                for previous in self.centre.path_memory.entries(entry.path)[-1:]
-            ]
-            return replace(new, sequence=max([FIRST_REPLAYED, *last]))
-        return new
+            return replace(entry, sequence=max(FIRST_REPLAYED, known.last + 1))
+        return entry
 
-    def new_attempts(self, sessions: Iterable[SessionId], remembered: Attempts) -> Attempts:
-        """The robot's new attempts between known nodes, moved to the equivalents.
-
-        Args:
-            remembered: its attempts; `session` is a place in `sessions`.
+    def new_attempts(self) -> Attempts:
+        """The robot's attempts between known nodes that the fleet map, as written, has not.
 
         Returns:
-            `session` is a place in the sessions of the robot's map; `reference` and `node` are
-            indices of its graph.
+            Moved to the equivalents. `session` is a place in the sessions of the robot's map;
+            `reference` and `node` are indices of its graph.
         """
         positions = [self.equivalent(node.id) for node in self.robot.graph.nodes]
         known = np.array([position is not None for position in positions], np.bool_)
         made = self.robot.attempts
         made = made.rows(known[made.reference] & known[made.node])
-        place: dict[SessionId, int] = {}
-        for session in (*sessions, *self.robot.sessions):
-            place.setdefault(session, len(place))
-        named = np.array([place[session] for session in self.robot.sessions], np.int32)
-        new = made.rows(replace(made, session=named[made.session]).lacking(remembered))
+        remembered = self.centre.lookups.attempts(list(self.robot.sessions))
+        new = made.rows(made.lacking(remembered))
         return new.moved_to(
             [None if position is None else position.node_from_live for position in positions]
         )
@@ -282,6 +289,7 @@ class Merge:
     def take(self, stored: StoredNode, frame: Frame) -> int:
         """Adds a node to the fleet map; returns its dense index."""
         self.writer.copy_node(stored, frame)
+        self.taken.add(stored.node.id)
         self._parts.add(stored.node.id)
         return self.graph.add_node(stored.node)
 
@@ -304,23 +312,47 @@ class Merge:
         """Writes edges that are in the graph already."""
         for edge in edges:
             self.writer.add_edge(edge)
-            a, b = (end if end in self._parts else _CENTRE for end in (edge.a, edge.b))
-            self._parts.merge(a, b)
+            self._join(edge)
             self.report.edges += 1
 
-    def add_entries(self, entries: Iterable[PathEntry]) -> None:
-        """Adds the entries that are missing from the fleet map's paths."""
-        for entry in entries:
-            new = self.new_entry(entry)
-            if new is not None:
-                self._known_entries(new.path).add(_key(new))
-                self.centre.path_memory.add(new)
-                self.writer.add_path_entry(new)
-                self.report.path_entries += 1
+    def see_edges_again(self) -> None:
+        """Adds the edges of nodes that a revert had hidden and this merge shows again."""
+        self.writer.checkpoint()
+        shown = [
+            edge
+            for edge in self.centre.lookups.edges(self.taken)
+            if self.graph.find_edge(edge.a, edge.b, edge.kind) is None
+        ]
+        self.graph.add_edges(shown)
+        for edge in shown:
+            self._join(edge)
 
-    def _known_entries(self, path: PathId) -> set[_EntryKey]:
+    def _join(self, edge: Edge) -> None:
+        self.joined.append((edge.a, edge.b))
+        self._parts.merge(*(end if end in self.taken else _CENTRE for end in (edge.a, edge.b)))
+
+    def add_entries(self, entries: Iterable[PathEntry]) -> None:
+        """Adds the robot's entries that are missing from the fleet map's paths."""
+        for entry in entries:
+            self._add_entry(self.new_entry(entry))
+
+    def add_replayed(self, entries: Iterable[PathEntry]) -> None:
+        """Adds what a replay matched, at nodes of the fleet map."""
+        for entry in entries:
+            self._add_entry(self._numbered(entry))
+
+    def _add_entry(self, new: PathEntry | None) -> None:
+        if new is not None:
+            self._known_entries(new.path).add(new)
+            self.centre.path_memory.add(new)
+            self.writer.add_path_entry(new)
+            self.report.path_entries += 1
+
+    def _known_entries(self, path: PathId) -> _KnownEntries:
         if path not in self._entries:
-            self._entries[path] = set(map(_key, self.centre.path_memory.entries(path)))
+            known = self._entries[path] = _KnownEntries()
+            for entry in self.centre.lookups.entries(path):
+                known.add(entry)
         return self._entries[path]
 
 
@@ -335,6 +367,18 @@ def _key(entry: PathEntry) -> _EntryKey:
     """Identity of a path entry, independent of who numbered it."""
     is_replayed = entry.kind is PathEntryKind.REPLAYED
     return (entry.node, entry.stamp_ns) if is_replayed else entry.sequence
+
+
+@dataclass(slots=True)
+class _KnownEntries:
+    """Entries of a path: what identifies them, and the largest sequence number."""
+
+    keys: set[_EntryKey] = field(default_factory=set)
+    last: int = -1
+
+    def add(self, entry: PathEntry) -> None:
+        self.keys.add(_key(entry))
+        self.last = max(self.last, entry.sequence)
 
 
 _NS_PER_S = 1_000_000_000
@@ -364,7 +408,7 @@ def check_fits(merge: Merge) -> None:
                 f"another one, of {ours.robot}, in the fleet map: one of the two maps is "
                 "wrong"
             )
-    landmarks = merge.centre.landmark_hashes
+    landmarks = merge.centre.lookups.landmark_hashes(robot.landmark_hashes)
     for node, brought in robot.landmark_hashes.items():
         held = landmarks.get(node, brought)
         if held != brought or not _same_record(merge, node):
@@ -387,10 +431,10 @@ def _drive(session: Session) -> tuple[str, str, int]:
 
 def _same_record(merge: Merge, node: NodeId) -> bool:
     """Whether both maps have the node with the same drive, stamp and camera."""
-    graphs = merge.graph, merge.robot.graph
-    if not all(node in graph for graph in graphs):
+    graph = merge.robot.graph
+    if node not in merge.held or node not in graph:
         return True
-    records = (graph.node(graph.index(node)) for graph in graphs)
+    records = merge.held[node].node, graph.node(graph.index(node))
     ours, theirs = ((record.session, record.stamp_ns, record.camera) for record in records)
     return ours == theirs
 
@@ -492,7 +536,9 @@ def overlapping(
 def _spans(merge: Merge) -> list[Span]:
     sessions = {**merge.centre.sessions, **merge.robot.sessions}
     last = {session.id: session.start_ns for session in sessions.values()}
-    for node in (*merge.graph.nodes, *merge.robot.graph.nodes):
+    for session_id, stamp_ns in merge.centre.lookups.last_stamps_ns().items():
+        last[session_id] = max(last[session_id], stamp_ns)
+    for node in merge.robot.graph.nodes:
         last[node.session] = max(last[node.session], node.stamp_ns)
     return [
         Span(session, session.begin_ns, last[session.id] + session.shift_ns)

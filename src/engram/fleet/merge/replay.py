@@ -395,7 +395,8 @@ class Replay(ResultSink):
         """One for all segments, since indexing all nodes is slow."""
         name, descriptor = self._options.relocaliser_name, self._settings.frontend.descriptor
         centre = self._merge.centre
-        return None if name is None else relocaliser_in(centre, name, descriptor, centre.graph)
+        graph = self._merge.graph
+        return None if name is None else relocaliser_in(centre, name, descriptor, graph)
 
     def _localiser_of(
         self, session: Session, segment: Segment, relocaliser: Relocaliser | None
@@ -415,8 +416,9 @@ class Replay(ResultSink):
             clock=session,
         )
         if session.id not in self._iterations:
-            made = (store.last_iterations.get(session.id, -1) for store in (robot, centre))
-            self._iterations[session.id] = max(made) + _ITERATION_GAP
+            remembered = centre.lookups.attempts([session.id]).iteration
+            made = robot.last_iterations.get(session.id, -1)
+            self._iterations[session.id] = max([made, *remembered.tolist()]) + _ITERATION_GAP
         localiser.resume(segment.nodes[0].driven_m, self._iterations[session.id])
         return localiser
 

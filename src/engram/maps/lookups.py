@@ -1,0 +1,254 @@
+"""What a map has of given nodes, paths and sessions: found by indices, at any size of the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from sqlalchemy import Connection, Table, select
+
+from engram.geometry.se3 import SE3
+from engram.graph.model import (
+    Edge,
+    Goal,
+    Node,
+    NodeId,
+    Omission,
+    PathEntry,
+    PathEntryKind,
+    PathId,
+    SessionId,
+)
+from engram.graph.paths import Attempts
+from engram.maps.attempts import unpack
+from engram.maps.map_frame import Moves, moves
+from engram.maps.marks import counting
+from engram.maps.reading import load_cameras
+from engram.maps.rows import (
+    Row,
+    edges_from_rows,
+    member,
+    node_from_bytes,
+    node_from_row,
+    session_from_row,
+    transform_from_bytes,
+    uuid_from_bytes,
+    verified,
+)
+from engram.maps.runs import Runs
+from engram.maps.schema import (
+    attempts,
+    edges,
+    nodes,
+    omissions,
+    omitted_landmarks,
+    path_entries,
+    paths,
+    placements,
+    revisions,
+    sessions,
+)
+from engram.maps.sqlite import SqliteDatabase
+from engram.maps.totals import count_all, own_rows, state_at_head, totals_at
+from engram.maps.view import View, few
+
+
+@dataclass(frozen=True, slots=True)
+class HeldNode:
+    """A node of a map.
+
+    Attributes:
+        node: the record.
+        landmark_hash: hash (16 bytes) of its landmarks.
+        key: of its row.
+    """
+
+    node: Node
+    landmark_hash: bytes
+    key: int
+
+
+class Lookups:
+    """Questions to a map as of one view.
+
+    Args:
+        database: the map's.
+        view: the visible rows; those of an open revision as far as they are written.
+
+    Raises:
+        MapCorruptError: a row is damaged; of each method.
+    """
+
+    def __init__(self, database: SqliteDatabase, view: View) -> None:
+        self._database, self._view = database, view
+
+    def nodes(self, some: Iterable[NodeId]) -> dict[NodeId, HeldNode]:
+        """Those of some nodes that the map has."""
+        with self._database.reading() as connection:
+            rows = list(self._named(connection, nodes, some))
+            records = node_records(connection, rows)
+        held = zip(records, rows, strict=True)
+        return {node.id: HeldNode(node, row["landmark_hash"], row["key"]) for node, row in held}
+
+    def omissions(self, some: Iterable[NodeId]) -> dict[NodeId, Omission]:
+        """Those of some nodes that the map omitted, each with its newest visible equivalent."""
+        some = list(some)
+        with self._database.reading() as connection:
+            rows = list(self._named(connection, omissions, some))
+            ids = _node_ids(connection, {row["node"] for row in rows})
+            hashes = {
+                row["uuid"]: row["landmark_hash"]
+                for row in self._named(connection, omitted_landmarks, some)
+            }
+        found = {}
+        for row in rows:
+            omitted = node_from_bytes(row["uuid"])
+            pose = transform_from_bytes(row["node_from_omitted"], f"omission {omitted}")
+            found[omitted] = Omission(omitted, ids[row["node"]], pose, hashes.get(row["uuid"]))
+        return found
+
+    def landmark_hashes(self, some: Iterable[NodeId]) -> dict[NodeId, bytes]:
+        """Hash (16 bytes) of the landmarks of some nodes that the map has, or had omitted."""
+        some = list(some)
+        with self._database.reading() as connection:
+            return {
+                node_from_bytes(row["uuid"]): row["landmark_hash"]
+                for table in (omitted_landmarks, nodes)
+                for row in self._named(connection, table, some)
+            }
+
+    def entries(self, path: PathId) -> list[PathEntry]:
+        """A path's entries by sequence number; none of an unknown path."""
+        with self._database.reading() as connection:
+            key = select(paths.c.key).where(paths.c.uuid == path.bytes).scalar_subquery()
+            query = self._view.select(path_entries).where(path_entries.c.path == key)
+            rows = {
+                row["sequence"]: row for row in verified(path_entries, connection.execute(query))
+            }
+            ids = _node_ids(connection, {row["node"] for row in rows.values()})
+        return [
+            PathEntry(
+                path,
+                sequence,
+                ids[row["node"]],
+                member(PathEntryKind, row["kind"], "path_entries"),
+                row["stamp_ns"],
+            )
+            for sequence, row in sorted(rows.items())
+        ]
+
+    def attempts(self, some: Sequence[SessionId]) -> Attempts:
+        """Remembered attempts of some sessions.
+
+        Returns:
+            `session` is a place in `some`, `reference` and `node` are keys of nodes.
+        """
+        parts = []
+        with self._database.reading() as connection:
+            hidden = list(connection.execute(self._view.hidden_keys(nodes)).scalars())
+            for place, session in enumerate(some):
+                key = select(sessions.c.key).where(sessions.c.uuid == session.bytes)
+                query = self._view.select(attempts).where(
+                    attempts.c.session == key.scalar_subquery()
+                )
+                for row in verified(attempts, connection.execute(query)):
+                    made = unpack(row["body"], row["count"])
+                    made = replace(made, session=np.full(len(made), place, np.int32))
+                    unseen = np.isin(np.stack([made.reference, made.node]), hidden)
+                    parts.append(made.rows(np.flatnonzero(~unseen.any(axis=0))))
+        return Attempts.joined(parts)
+
+    def edges(self, some: Iterable[NodeId]) -> list[Edge]:
+        """The edges at some nodes, each once; of those with one (a, b, kind) the newest."""
+        keys = [held.key for held in self.nodes(some).values()]
+        with self._database.reading() as connection:
+            rows = {
+                (row["a"], row["b"], row["kind"]): row
+                for part in few(keys)
+                for end in (edges.c.a, edges.c.b)
+                for row in verified(
+                    edges, connection.execute(self._view.select(edges).where(end.in_(part)))
+                )
+            }
+            kept = counting(connection, self._view, list(rows.values()))
+            ids = _node_ids(connection, {row[end] for row in kept for end in ("a", "b")})
+        return list(edges_from_rows(kept, [(ids[row["a"]], ids[row["b"]]) for row in kept]))
+
+    def last_stamps_ns(self) -> dict[SessionId, int]:
+        """Stamp of the node that each session saved last, of sessions that saved any."""
+        newest = (
+            select(nodes.c.stamp_ns)
+            .where(nodes.c.session == sessions.c.key)
+            .order_by(nodes.c.key.desc())
+            .limit(1)
+            .scalar_subquery()
+        )
+        query = self._view.select(sessions).with_only_columns(sessions.c.uuid, newest)
+        with self._database.reading() as connection:
+            return {
+                SessionId(uuid_from_bytes(uuid, "a session")): stamp_ns
+                for uuid, stamp_ns in connection.execute(query)
+                if stamp_ns is not None
+            }
+
+    def runs(self) -> Runs:
+        """Which nodes are connected as of the newest committed revision."""
+        with self._database.reading() as connection:
+            _, runs = state_at_head(connection, self._view.at)
+            return count_all(connection, View(self._view.at))[1] if runs is None else runs
+
+    def moves(self, number: int, goals: Sequence[Goal]) -> Moves:
+        """What a revision moved in the map frame.
+
+        Args:
+            number: of the revision.
+            goals: goals known before it.
+        """
+        with self._database.reading() as connection:
+            query = select(revisions).where(revisions.c.number == number)
+            own = own_rows(next(verified(revisions, connection.execute(query))))
+            placed = select(placements.c.node).where(own.rows(placements)).distinct()
+            keys = set(connection.execute(placed).scalars())
+            at_goals = self._named(connection, nodes, {goal.node for goal in goals})
+            keys |= {row["key"] for row in at_goals}
+            before, after = (places_of(connection, View(at), keys) for at in (number - 1, number))
+            ids = _node_ids(connection, before.keys())
+            of_nodes = totals_at(connection, number - 1).nodes
+        was, now = ({ids[key]: places[key] for key in before} for places in (before, after))
+        return replace(moves(was, now, goals), of_nodes=of_nodes)
+
+    def _named(self, connection: Connection, table: Table, some: Iterable[NodeId]) -> Iterator[Row]:
+        """The visible rows of a table about some nodes, the newest last."""
+        for part in few([one.bytes for one in some]):
+            query = self._view.select(table).where(table.c.uuid.in_(part))
+            yield from verified(table, connection.execute(query))
+
+
+def node_records(connection: Connection, rows: Sequence[Row]) -> list[Node]:
+    """The nodes of rows."""
+    cameras = load_cameras(connection)
+    drives = {}
+    for part in few(sorted({row["session"] for row in rows})):
+        query = select(sessions).where(sessions.c.key.in_(part)).order_by(sessions.c.key)
+        for row in verified(sessions, connection.execute(query)):
+            drives[row["key"]] = session_from_row(row, cameras[row["camera"]].id).id
+    return [node_from_row(row, drives[row["session"]], cameras[row["camera"]].id) for row in rows]
+
+
+def places_of(connection: Connection, view: View, keys: Iterable[int]) -> dict[int, SE3]:
+    """The newest place of each of some nodes that have one, by key."""
+    found = {}
+    for part in few(sorted(keys)):
+        query = view.select(placements).where(placements.c.node.in_(part))
+        for row in verified(placements, connection.execute(query)):
+            found[row["node"]] = transform_from_bytes(row["map_from_node"], "a placement")
+    return found
+
+
+def _node_ids(connection: Connection, keys: Iterable[int]) -> dict[int, NodeId]:
+    found: dict[int, NodeId] = {}
+    for part in few(sorted(keys)):
+        query = select(nodes.c.key, nodes.c.uuid).where(nodes.c.key.in_(part))
+        found |= {key: node_from_bytes(uuid) for key, uuid in connection.execute(query)}
+    return found
