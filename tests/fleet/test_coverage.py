@@ -138,7 +138,7 @@ def stock(centre):
 
 
 def test_who_got_on_with_whom_is_learnt_from_attempts_and_hours(stock):
-    found = affinities(stock, MatchBasin.of(400.0, stock.basin_counts))
+    found = affinities(stock, MatchBasin.of(400.0, stock.store.totals().basin_counts))
     r1, r2, r3, r4 = range(4)
     # r3 matched what r1 saved again and again, r4 what r2 saved; crosswise nothing matched.
     assert found[r3, r1] > 0.8

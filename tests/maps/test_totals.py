@@ -7,13 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram.graph.model import EdgeKind, Removal
-from engram.maps import revisions
+from engram.graph.basin import BasinCounts, count_attempts
+from engram.graph.model import EdgeKind, NodeId, PathEntry, PathEntryKind, Removal, path_id
+from engram.graph.paths import Attempts
+from engram.maps import counting, reading
 from engram.maps.map import Map
 from engram.maps.runs import Runs
+from engram.maps.schema import nodes as nodes_table
 from engram.maps.schema import runs as runs_table
 
-from .maps import begin, edge, session, write_drive
+from .maps import attempt, begin, edge, node, node_frame, session, write_drive
 
 
 def compare(location: Path, at: int | None = None) -> None:
@@ -35,9 +38,32 @@ def _compare(store: Map) -> None:
     assert (found.components, found.largest_component) == (len(counts), counts.max(initial=0))
     steps = [one.a_from_b for one in contents.edges if one.kind is EdgeKind.ODOMETRY]
     assert found.mapped_m == pytest.approx(sum(one.distance_m for one in steps))
+    assert_counts(store, found.basin_counts)
     assert found.right_m == pytest.approx(
         max((pose.translation[0] for pose in store.placements.values()), default=None)
     )
+
+
+def assert_counts(store: Map, counts: BasinCounts) -> None:
+    """Compares the counts with those of all attempts at nodes that are there."""
+    with store._database.reading() as connection:
+        tables = reading.attempt_tables(connection, store._view)
+        rows = list(store._view.rows(connection, nodes_table))
+    experience_of = dict(zip((row["key"] for row in rows), store.graph.experiences, strict=True))
+    made = Attempts.joined(list(tables.values()))
+    drives = np.repeat(np.arange(len(tables)), [len(one) for one in tables.values()])
+    here = np.isin(made.node, list(experience_of))
+    made = made.rows(here)
+    expected = count_attempts(
+        drives[here],
+        np.array([experience_of[key] for key in made.node.tolist()], np.int64),
+        made.iteration,
+        (made.along_m.astype(np.float64), made.across_m.astype(np.float64)),
+        made.sigma_m.astype(np.float64),
+        made.accepted,
+    )
+    np.testing.assert_array_equal(counts.attempts, expected.attempts)
+    np.testing.assert_array_equal(counts.successes, expected.successes)
 
 
 def test_they_agree_after_every_kind_of_revision(location: Path) -> None:
@@ -75,11 +101,66 @@ def test_they_agree_after_every_kind_of_revision(location: Path) -> None:
         compare(location, at)
 
 
+def test_attempts_count_with_those_of_earlier_revisions(location: Path) -> None:
+    """A drive's attempt counts if it matched the experience shortly before."""
+    with Map.create(location) as store:
+        with begin(store, session("robot-1")) as writer:
+            nodes = [one.id for one in write_drive(writer, 6).nodes]
+            writer.commit()
+        compare(location)
+        before = store.totals().basin_counts.attempts.sum()
+
+        def more(first: int, on: NodeId) -> None:
+            made = [attempt(at, nodes[0], on, along_m=2.0) for at in range(first, first + 4)]
+            with store.begin_revision(author="t", message="", configuration={}) as writer:
+                writer.copy_attempts(session("robot-1").id, *Attempts.of(made))
+                writer.commit()
+            compare(location)
+
+        more(6, nodes[5])
+        more(9, nodes[2])
+        assert store.totals().basin_counts.attempts.sum() >= before + 8
+        with begin(store, session("robot-2")) as writer:
+            others = [one.id for one in write_drive(writer, 4).nodes]
+            writer.commit()
+        more(14, others[3])
+    for at in range(5):
+        compare(location, at)
+
+
+def test_attempts_count_anew_where_experiences_join(location: Path) -> None:
+    with Map.create(location) as store:
+        with begin(store, session("robot-1")) as writer:
+            nodes = [node(writer.session, index) for index in range(6)]
+            for index, one in enumerate(nodes):
+                writer.add_node(one, node_frame(writer.session, index))
+                if index not in {0, 3}:
+                    writer.add_edge(edge(nodes[index - 1].id, one.id, seed=index))
+            path = path_id(writer.session.id)
+            writer.add_path_entry(PathEntry(path, 0, nodes[0].id, PathEntryKind.SAVED, 0))
+            tried = [
+                attempt(at, nodes[0].id, nodes[0 if at % 4 else 5].id, accepted=at % 4 > 0)
+                for at in range(20, 40)
+            ]
+            writer.add_attempts(tried)
+            writer.commit()
+        compare(location)
+        apart = store.totals()
+        assert apart.experiences == 2
+        with store.begin_revision(author="t", message="joined", configuration={}) as writer:
+            writer.add_edge(edge(nodes[2].id, nodes[3].id, EdgeKind.ODOMETRY, 1))
+            writer.commit()
+        compare(location)
+        assert store.totals().experiences == 1
+        joined = store.totals().basin_counts
+        assert joined.attempts.sum() > apart.basin_counts.attempts.sum()
+
+
 def test_a_commit_counts_its_own_rows_alone(location: Path, monkeypatch) -> None:
     def never(*_: object) -> None:
         raise AssertionError("the whole map was counted")
 
-    monkeypatch.setattr(revisions, "count_all", never)
+    monkeypatch.setattr(counting, "count_all", never)
     with Map.create(location) as store:
         for name in ("robot-1", "robot-2"):
             with begin(store, session(name)) as writer:

@@ -101,6 +101,10 @@ class BasinCounts:
         """Those of other drives counted, too."""
         return BasinCounts(self.attempts + other.attempts, self.successes + other.successes)
 
+    def __sub__(self, other: BasinCounts) -> BasinCounts:
+        """Without those of some of the drives."""
+        return BasinCounts(self.attempts - other.attempts, self.successes - other.successes)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MatchBasin:

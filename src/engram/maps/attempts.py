@@ -1,7 +1,9 @@
 """Stored attempts of drives, and stored words of nodes.
 
-One body is a MessagePack map: version, base of the iterations, names of the policies, keys of the
-nodes, and the packed rows.
+A drive's attempts are packed by the page of the attempted node, so that what past drives say about
+a place is read without what they say elsewhere. One body is a MessagePack map: version, base of the
+iterations, place of the first attempt, names of the policies, keys of the nodes, and the packed
+rows.
 
 Stored words of nodes, so that a large map can be searched without reading its landmarks. Words
 follow from a node's landmarks and a vocabulary. They belong to no revision and not to the content
@@ -10,12 +12,12 @@ hash. A missing or damaged row only costs the time to compute it again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from sqlalchemy import Connection, bindparam, select
 
 from engram.errors import InputError, MapCorruptError
@@ -25,9 +27,13 @@ from engram.maps.rows import Row, sealed, verified
 from engram.maps.schema import nodes, words
 from engram.maps.sqlite import SqliteDatabase, upsert
 
-_VERSION = 1
+# Node keys of a page of attempts: page p has those from PAGE · p + 1 on.
+PAGE = 128
+
+_VERSION = 2
 _PACKED = np.dtype(
     [
+        ("place", "<u2"),  # among the drive's attempts of this revision, above that of the first
         ("iteration", "<u2"),  # above the base
         ("reference", "<u2"),  # index into the body's nodes
         ("node", "<u2"),
@@ -41,6 +47,8 @@ _PACKED = np.dtype(
         ("flags", "u1"),  # bit 7: accepted; the rest: index into the body's policies
     ]
 )
+# Of maps of format 6: a drive's attempts one after another.
+_LAYOUTS = {1: np.dtype([one for one in _PACKED.descr if one[0] != "place"]), _VERSION: _PACKED}
 # Code 0 is 0, code c is 2^((c - 1)/12 - 10): 0.001 to 1,900 in steps of 6 %; 255 is unknown.
 _SIGMA_TABLE = np.concatenate([[0.0], np.exp2((np.arange(254) / 12) - 10), [np.inf]]).astype(
     np.float32
@@ -48,9 +56,8 @@ _SIGMA_TABLE = np.concatenate([[0.0], np.exp2((np.arange(254) / 12) - 10), [np.i
 _SIGMA_BORDERS = np.concatenate(
     [[2.0**-10.5], np.exp2((np.arange(253) + 0.5) / 12 - 10), [2.0 ** (253.5 / 12 - 10)]]
 )
-# Most iterations and nodes of a body; twice as many attempts fill 2.4 MB.
+# Most places, iterations and nodes that a body spans.
 _SPAN = 65536
-_ROWS = 131072
 _POLICIES = 128
 
 # Of `Attempts`, in the order in which the content hash takes them.
@@ -75,28 +82,42 @@ class _Body(msgspec.Struct, forbid_unknown_fields=True):
     policies: list[str]
     nodes: bytes
     rows: bytes
+    first: int = 0
 
 
 _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(_Body)
 
 
-def pack(table: Attempts) -> list[tuple[int, bytes]]:
-    """The bodies of one session's attempts, in order, each with its number of attempts.
+def page_of(keys: ArrayLike) -> NDArray[np.int64]:
+    """(K,) int64: the page on which attempts at the nodes with these keys, (K,), are stored."""
+    return (np.asarray(keys, np.int64) - 1) // PAGE
 
-    Their `reference` and `node` are keys.
+
+def pack(table: Attempts, first: int = 0) -> list[Row]:
+    """One session's attempts as `page`, `count` and `body` of rows, by page and then in order.
+
+    Args:
+        table: `reference` and `node` are keys.
+        first: how many attempts of the session the revision has before these.
     """
-    bodies = []
-    start = 0
-    while start < len(table):
-        stop = _body_end(table, start)
-        bodies.append((stop - start, _pack_body(table.rows(slice(start, stop)))))
-        start = stop
-    return bodies
+    pages = page_of(table.node)
+    order = np.argsort(pages, kind="stable")
+    pages, places, table = pages[order], first + order, table.rows(order)
+    return [
+        {
+            "page": int(pages[start]),
+            "count": stop - start,
+            "body": _pack_body(table.rows(slice(start, stop)), places[start:stop]),
+        }
+        for start, stop in _bodies(table, pages, places)
+    ]
 
 
-def unpack(body: bytes, count: int) -> Attempts:
-    """The attempts of one body; `reference` and `node` are keys, `session` is 0.
+def unpack(body: bytes, count: int) -> tuple[NDArray[np.int64], Attempts]:
+    """The attempts of one body, and their places (count,) among those of session and revision.
+
+    Their `reference` and `node` are keys, `session` is 0.
 
     Raises:
         MapCorruptError: the body is malformed or does not hold `count` attempts.
@@ -105,12 +126,13 @@ def unpack(body: bytes, count: int) -> Attempts:
         content = _decoder.decode(body)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise MapCorruptError(f"attempts: the packed body is malformed: {error}") from error
-    if content.version != _VERSION or len(content.nodes) % 8 or len(content.rows) % 18:
+    layout = _LAYOUTS.get(content.version)
+    if layout is None or len(content.nodes) % 8 or len(content.rows) % layout.itemsize:
         raise MapCorruptError(
             f"attempts: version {content.version}, {len(content.nodes)} bytes of nodes, "
             f"{len(content.rows)} bytes of rows do not fit version {_VERSION}"
         )
-    rows = np.frombuffer(content.rows, _PACKED)
+    rows = np.frombuffer(content.rows, layout)
     nodes = np.frombuffer(content.nodes, "<i8").astype(np.int64)
     policy = (rows["flags"] & 127).astype(np.int32)
     ends = np.concatenate([rows["reference"], rows["node"]])
@@ -119,12 +141,13 @@ def unpack(body: bytes, count: int) -> Attempts:
         or not count
         or ends.max() >= len(nodes)
         or policy.max() >= len(content.policies)
-        or abs(content.base) >= 2**62
+        or max(abs(content.base), abs(content.first)) >= 2**62
     ):
         raise MapCorruptError(
             f"attempts: {len(rows)} packed rows, {count} expected, or bad indices"
         )
-    return Attempts(
+    places = rows["place"] if content.version == _VERSION else np.arange(count)
+    return places.astype(np.int64) + content.first, Attempts(
         session=np.zeros(count, np.int32),
         iteration=rows["iteration"].astype(np.int64) + content.base,
         reference=nodes[rows["reference"]],
@@ -142,15 +165,44 @@ def unpack(body: bytes, count: int) -> Attempts:
     )
 
 
-def _body_end(table: Attempts, start: int) -> int:
+def unpack_drive(rows: Sequence[Row]) -> Attempts:
+    """The attempts of one session, in the order in which they were made.
+
+    Args:
+        rows: of `attempts`, those of earlier revisions first.
+    """
+    parts = [unpack(row["body"], row["count"]) for row in rows]
+    made = Attempts.joined([one for _, one in parts])
+    revisions = list(dict.fromkeys(row["revision"] for row in rows))
+    ages = [revisions.index(row["revision"]) for row in rows]
+    if not parts:
+        return made
+    places = np.concatenate([one for one, _ in parts])
+    return made.rows(np.lexsort((places, np.repeat(ages, [row["count"] for row in rows]))))
+
+
+def _bodies(
+    table: Attempts, pages: NDArray[np.int64], places: NDArray[np.int64]
+) -> Iterator[tuple[int, int]]:
+    """First and last row, exclusive, of each body of attempts that are sorted by page."""
+    ends = [*(np.flatnonzero(np.diff(pages)) + 1).tolist(), len(table)]
+    start = 0
+    for end in ends:
+        while start < end:
+            stop = _body_end(table, places, start, end)
+            yield start, stop
+            start = stop
+
+
+def _body_end(table: Attempts, places: NDArray[np.int64], start: int, end: int) -> int:
     """The longest run from `start` that fits into one body."""
-    stop = min(start + _ROWS, len(table))
+    stop = end
     while stop - start > 1:
         rows = slice(start, stop)
-        iteration = table.iteration[rows]
         nodes = np.concatenate([table.reference[rows], table.node[rows]])
         if (
-            int(iteration.max() - iteration.min()) < _SPAN
+            np.ptp(table.iteration[rows]) < _SPAN
+            and places[stop - 1] - places[start] < _SPAN
             and len(np.unique(nodes)) <= _SPAN
             and len(np.unique(table.policy[rows])) <= _POLICIES
         ):
@@ -159,7 +211,7 @@ def _body_end(table: Attempts, start: int) -> int:
     return stop
 
 
-def _pack_body(made: Attempts) -> bytes:
+def _pack_body(made: Attempts, places: NDArray[np.int64]) -> bytes:
     nodes = np.unique(np.concatenate([made.reference, made.node]))
     used, policy = np.unique(made.policy, return_inverse=True)
     # Sorted by name, so that equal attempts give equal bodies.
@@ -167,6 +219,7 @@ def _pack_body(made: Attempts) -> bytes:
     policy = np.array([policies.index(made.policies[at]) for at in used])[policy]
     base = int(made.iteration.min())
     packed = np.empty(len(policy), _PACKED)
+    packed["place"] = places - places[0]
     packed["iteration"] = made.iteration - base
     for name in ("reference", "node"):
         packed[name] = np.searchsorted(nodes, getattr(made, name))
@@ -184,6 +237,7 @@ def _pack_body(made: Attempts) -> bytes:
         policies=policies,
         nodes=nodes.astype("<i8").tobytes(),
         rows=packed.tobytes(),
+        first=int(places[0]),
     )
     return _encoder.encode(body)
 

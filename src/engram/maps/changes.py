@@ -45,7 +45,10 @@ _SIZES = {
 }
 # Tables whose rows are read whole. Of sessions and attempts only these columns are read.
 _WHOLE = (nodes, edges, paths, path_entries, omissions, placements)
-_PARTLY = {sessions: ("key", "revision", "camera"), attempts: ("key", "revision", "count")}
+_PARTLY = {
+    sessions: ("key", "revision", "camera"),
+    attempts: ("key", "revision", "session", "count"),
+}
 # Of rows that are equal in these columns the newest counts.
 _SUPERSEDED_BY = {
     edges: ("a", "b", "kind"),

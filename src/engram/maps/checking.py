@@ -23,7 +23,7 @@ from engram.frontend.features import feature_kind
 from engram.frontend.frame import DescriptorKind, FrameStatus
 from engram.geometry.cameras import StereoCamera
 from engram.graph.model import NodeId, PathEntryKind, SessionId
-from engram.maps.attempts import decode_words, unpack
+from engram.maps.attempts import decode_words, page_of, unpack
 from engram.maps.content import verified_hash
 from engram.maps.marks import goal_from_row, removal_from_row
 from engram.maps.place_blocks import problem_of
@@ -408,7 +408,9 @@ def _check_omitted_landmarks(_: _Checking, row: Row) -> None:
 
 def _check_attempts(checking: _Checking, row: Row) -> None:
     checking.blobs += 1
-    table = unpack(row["body"], row["count"])
+    _, table = unpack(row["body"], row["count"])
+    if (page_of(table.node) != row["page"]).any():
+        raise MapCorruptError(f"has attempts at nodes that are not of page {row['page']}")
     revision = checking.revision_rows.get(row["revision"])
     if revision is None:
         return  # reported already

@@ -19,7 +19,7 @@ from sqlalchemy import ColumnElement, Connection, Table, select
 
 from engram.errors import MapCorruptError
 from engram.graph.paths import Attempts
-from engram.maps.attempts import COLUMNS, unpack
+from engram.maps.attempts import COLUMNS, unpack_drive
 from engram.maps.reading import load_cameras, load_frontends
 from engram.maps.rows import Row, verified, verified_values
 from engram.maps.schema import (
@@ -224,7 +224,7 @@ def _canonical_attempts(rows: list[Row], known: Identities) -> dict[int, bytes]:
         packed.setdefault((row["revision"], row["session"]), []).append(row)
     found: dict[int, bytes] = {}
     for (revision, session), bodies in packed.items():
-        table = Attempts.joined([unpack(row["body"], row["count"]) for row in bodies])
+        table = unpack_drive(bodies)
         content = _encode(
             [
                 known.of("revisions", [revision])[revision],

@@ -7,23 +7,71 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from sqlalchemy import Connection
+from sqlalchemy import Connection, select
 
 from engram.errors import MapCorruptError
 from engram.geometry.cameras import CameraId
+from engram.graph.basin import BasinCounts
 from engram.graph.graph import labels_of
-from engram.maps.changes import Changes, Touched, columns_of, rows_within
+from engram.graph.model import EdgeKind
+from engram.maps.attempts import page_of
+from engram.maps.changes import Changes, Touched, columns_of, rows_within, stretches
 from engram.maps.columns import Columns
 from engram.maps.marks import without_removed
-from engram.maps.reading import load_cameras
+from engram.maps.reading import descriptor_of, load_cameras
+from engram.maps.records import MapInfo
+from engram.maps.rows import verified
 from engram.maps.runs import Keys, Runs
 from engram.maps.schema import attempts, edges, nodes, path_entries, paths, placements, sessions
-from engram.maps.totals import Owners, Totals, greater_m, joints, right_m_of, with_edges
+from engram.maps.totals import (
+    Owners,
+    Totals,
+    basin_of,
+    count_all,
+    greater_m,
+    joints,
+    right_m_of,
+    state_at_head,
+    totals_at,
+    with_edges,
+)
 from engram.maps.view import View
 
 _FILMED = (sessions, nodes)
 # Nodes whose edges are read at once, and how many times from one part before the next.
 _AT_ONCE, _STEPS = 256, 4
+
+
+def totals_of(connection: Connection, view: View) -> Totals:
+    """The totals of a view: as stored, with what an open revision has by now."""
+    return totals_at(connection, view.at) if view.own is None else count_open(connection, view)[0]
+
+
+def info(connection: Connection, view: View, *, size_bytes: int) -> MapInfo:
+    """Counts and sizes of the map."""
+    found = totals_of(connection, view)
+    return MapInfo(
+        revision=view.at,
+        descriptor=descriptor_of(connection, view),
+        cameras=len(found.cameras),
+        sessions=found.sessions,
+        nodes=found.nodes,
+        edges=sum(found.edges.values()),
+        edges_of_kind={str(kind): found.edges[kind] for kind in EdgeKind if kind in found.edges},
+        path_entries=found.path_entries,
+        attempts=found.attempts,
+        mapped_m=found.mapped_m,
+        size_bytes=size_bytes,
+    )
+
+
+def count_open(connection: Connection, view: View) -> tuple[Totals, Runs, Runs | None]:
+    """The totals and runs with an open revision, and the stored runs, if they fit."""
+    before, runs = state_at_head(connection, view.at)
+    if runs is None:
+        return *count_all(connection, view), None
+    changes = Changes.between(connection, View(view.at), view)
+    return *count_on(connection, view, before, runs, changes), runs
 
 
 def count_on(
@@ -54,9 +102,52 @@ def count_on(
         forward={camera: shift for camera, shift in found.forward.items() if camera in cameras},
         right_m=_right_m(connection, view, before, changes[placements]),
     )
-    runs = _parted(connection, runs, changes, owners)
-    runs = runs.with_nodes(fresh["key"]).joined(*joints(changes[edges].gained, owners))
-    return found.of_runs(runs), runs
+    after = _parted(connection, runs, changes, owners)
+    after = after.with_nodes(fresh["key"]).joined(*joints(changes[edges].gained, owners))
+    basin = _basin(connection, before, runs, after, changes)
+    return found.with_basin(basin).of_runs(after), after
+
+
+def _basin(
+    connection: Connection, before: Totals, runs: Runs, after: Runs, changes: Changes
+) -> BasinCounts:
+    """Counts of attempts: of the sessions concerned all are counted again."""
+    found = before.basin_counts
+    for session in _concerned(connection, before, runs, after, changes):
+        query = select(attempts).where(attempts.c.session == session).order_by(attempts.c.key)
+        rows = list(verified(attempts, connection.execute(query)))
+        parts = [
+            [row for row in rows if shown.has(attempts, row["key"], row["revision"])]
+            for shown in (changes.before, changes.after)
+        ]
+        found = found - basin_of(parts[0], runs) + basin_of(parts[1], after)
+    return found
+
+
+def _concerned(
+    connection: Connection, before: Totals, runs: Runs, after: Runs, changes: Changes
+) -> set[int]:
+    """Sessions whose attempts may count otherwise than before, by key.
+
+    They gain or lose attempts, or made some at nodes that come or go or whose experience is another
+    one.
+    """
+    tried = changes[attempts]
+    found = set(tried.rows["session"][tried.seen[0] != tried.seen[1]].tolist())
+    if not before.attempts:
+        return found
+    known, come = changes[nodes], changes[nodes].gained
+    again = come["key"][np.isin(come["revision"], list(changes.before.places))]
+    parts = [(int(key), int(key)) for key in (*known.lost["key"], *again)]
+    pages = {
+        page
+        for first, last in (*parts, *runs.regrouped(after))
+        for page in range(int(page_of(first)), int(page_of(last)) + 1)
+    }
+    for first, last in stretches(pages):
+        query = select(attempts.c.session).where(attempts.c.page.between(first, last)).distinct()
+        found |= set(connection.execute(query.order_by(attempts.c.session)).scalars())
+    return found
 
 
 def _more(touched: Touched, column: str = "") -> int:

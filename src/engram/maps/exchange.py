@@ -26,7 +26,7 @@ from engram.maps.schema import (
     words,
 )
 from engram.maps.sqlite import SqliteDatabase
-from engram.maps.totals import count_all
+from engram.maps.totals import runs_of
 from engram.maps.view import View, head
 
 # In the order in which rows refer to each other.
@@ -109,4 +109,4 @@ def map_of_rows(path: Path) -> Iterator[PutRows]:
 
             yield put
             count_tags(connection)
-            save_runs(connection, None, count_all(connection, View(head(connection)))[1])
+            save_runs(connection, None, runs_of(connection, View(head(connection))))

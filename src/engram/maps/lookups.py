@@ -21,7 +21,7 @@ from engram.graph.model import (
     SessionId,
 )
 from engram.graph.paths import Attempts
-from engram.maps.attempts import unpack
+from engram.maps.attempts import unpack_drive
 from engram.maps.map_frame import Moves, moves
 from engram.maps.marks import counting
 from engram.maps.reading import load_cameras
@@ -50,7 +50,7 @@ from engram.maps.schema import (
     sessions,
 )
 from engram.maps.sqlite import SqliteDatabase
-from engram.maps.totals import count_all, own_rows, state_at_head, totals_at
+from engram.maps.totals import own_rows, runs_of, state_at_head, totals_at
 from engram.maps.view import View, few
 
 
@@ -152,11 +152,10 @@ class Lookups:
                 query = self._view.select(attempts).where(
                     attempts.c.session == key.scalar_subquery()
                 )
-                for row in verified(attempts, connection.execute(query)):
-                    made = unpack(row["body"], row["count"])
-                    made = replace(made, session=np.full(len(made), place, np.int32))
-                    unseen = np.isin(np.stack([made.reference, made.node]), hidden)
-                    parts.append(made.rows(np.flatnonzero(~unseen.any(axis=0))))
+                made = unpack_drive(list(verified(attempts, connection.execute(query))))
+                made = replace(made, session=np.full(len(made), place, np.int32))
+                unseen = np.isin(np.stack([made.reference, made.node]), hidden)
+                parts.append(made.rows(np.flatnonzero(~unseen.any(axis=0))))
         return Attempts.joined(parts)
 
     def edges(self, some: Iterable[NodeId]) -> list[Edge]:
@@ -196,7 +195,7 @@ class Lookups:
         """Which nodes are connected as of the newest committed revision."""
         with self._database.reading() as connection:
             _, runs = state_at_head(connection, self._view.at)
-            return count_all(connection, View(self._view.at))[1] if runs is None else runs
+            return runs_of(connection, View(self._view.at)) if runs is None else runs
 
     def moves(self, number: int, goals: Sequence[Goal]) -> Moves:
         """What a revision moved in the map frame.

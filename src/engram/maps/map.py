@@ -46,6 +46,7 @@ from engram.maps.attempts import (
 )
 from engram.maps.checking import check
 from engram.maps.content import content_hash, record_hashes, verified_hash
+from engram.maps.counting import info, totals_of
 from engram.maps.difference import STRETCH_M, MapDifference, difference
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
 from engram.maps.hiding import Reverted, compare, hide_revision
@@ -78,7 +79,7 @@ from engram.maps.rows import START, Row, checked_text, sealed, session_from_row,
 from engram.maps.schema import revisions
 from engram.maps.sqlite import SqliteDatabase, reading_rows
 from engram.maps.tags import Tag, TagWriter, load_tags, resolve
-from engram.maps.totals import Own, Totals, info, own_rows, totals_of
+from engram.maps.totals import Own, Totals, own_rows
 from engram.maps.view import KeyBook, View, head
 from engram.maps.writer import Resumable, RevisionWriter
 
@@ -156,7 +157,7 @@ class _Contents:
     last_iterations: Mapping[SessionId, int]
 
     @staticmethod
-    def of(contents: MapContents) -> _Contents:
+    def of(contents: MapContents, basin_counts: BasinCounts) -> _Contents:
         graph = graph_of(contents.nodes, contents.edges)
         path_memory = PathMemory(graph)
         path_memory.add_all(contents.path_entries)
@@ -164,7 +165,7 @@ class _Contents:
             graph,
             path_memory,
             contents.attempts,
-            contents.basin_counts(graph.experiences),
+            basin_counts,
             contents.last_iterations(),
         )
 
@@ -1094,7 +1095,7 @@ class Map:
             if self._contents is None:
                 with no_collections(), reading_rows(self.location):
                     found = self.load()
-                    self._contents = _Contents.of(found)
+                    self._contents = _Contents.of(found, self.totals().basin_counts)
                 # Attempts refer to sessions by position: both must be read together.
                 self.__dict__["sessions"] = {one.id: one for one in found.sessions}
             return self._contents

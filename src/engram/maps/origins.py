@@ -11,7 +11,7 @@ from sqlalchemy import Connection, func, or_, select
 
 from engram.errors import InputError
 from engram.graph.model import NodeId, SessionId
-from engram.maps.attempts import unpack
+from engram.maps.attempts import page_of, unpack
 from engram.maps.marks import counting
 from engram.maps.rows import Row, node_from_bytes, uuid_from_bytes, verified
 from engram.maps.schema import attempts, edges, hidden, nodes, path_entries, revisions, sessions
@@ -145,10 +145,10 @@ def _paths(connection: Connection, view: View, key: int) -> int:
 def _attempts(connection: Connection, view: View, key: int) -> dict[str, int]:
     """Number of visible attempts on a node, and of accepted ones."""
     hid = np.array(connection.execute(view.hidden_keys(nodes)).scalars().all(), np.int64)
-    mentions = func.instr(attempts.c.body, key.to_bytes(8, "little")) > 0
+    here = attempts.c.page == int(page_of(np.array(key)))
     found = {"attempts": 0, "matches": 0}
-    for row in verified(attempts, connection.execute(view.select(attempts).where(mentions))):
-        table = unpack(row["body"], row["count"])
+    for row in verified(attempts, connection.execute(view.select(attempts).where(here))):
+        _, table = unpack(row["body"], row["count"])
         tried = (table.node == key) & ~np.isin(table.reference, hid) & (key not in hid)
         found["attempts"] += int(tried.sum())
         found["matches"] += int(table.accepted[tried].sum())

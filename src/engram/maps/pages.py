@@ -7,8 +7,7 @@ the nodes of a page were saved one after another.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,16 +26,18 @@ from sqlalchemy import (
 
 from engram.errors import MapCorruptError
 from engram.geometry.cameras import CameraId
-from engram.graph.basin import BasinCounts, MatchBasin, count_attempts
-from engram.graph.graph import EDGE_KINDS, labels_of
-from engram.graph.model import EdgeKind, NodeId, PathEntryKind, PathId, SessionId, path_id
+from engram.graph.basin import MatchBasin
+from engram.graph.graph import EDGE_KINDS
+from engram.graph.model import EdgeKind, NodeId, PathEntryKind, PathId, SessionId
 from engram.graph.pages import PAGE, GraphPage
 from engram.graph.paths import ENTRY_KINDS, Attempts, Evidence
-from engram.maps.attempts import unpack
+from engram.maps.attempts import PAGE as ATTEMPT_PAGE
+from engram.maps.attempts import page_of, unpack
 from engram.maps.columns import Columns, Visible, read_columns
 from engram.maps.marks import removed_measurements, without_removed
 from engram.maps.reading import load_cameras, sessions_by_key
 from engram.maps.rows import (
+    Row,
     edge_arrays,
     from_json,
     member,
@@ -84,6 +85,8 @@ class MapPages:
             PathId(uuid_from_bytes(row["uuid"], f"path {row['key']}")) for row in path_rows
         ]
         self._path_numbers = {row["key"]: number for number, row in enumerate(path_rows)}
+        self._path_sessions = [row["session"] for row in path_rows]
+        self._silent: dict[int, bool] = {}  # by number of the path, as far as requested
 
     def page(self, number: int) -> GraphPage:
         """See `GraphPages`."""
@@ -186,29 +189,12 @@ class MapPages:
         Args:
             basin: gives the success rates of attempts.
         """
-        good, bad = np.zeros((2, self.end))
-        silent = set(range(len(self.sessions)))
-        for session, made in self._drives():
-            rates = basin.success_rate(
-                made.along_m.astype(np.float64), made.across_m.astype(np.float64)
-            )
-            np.add.at(good, made.node, made.accepted)
-            np.add.at(bad, made.node, np.where(made.accepted, 0.0, rates))
-            silent.discard(session)
-        quiet = {path_id(self.sessions[number]) for number in silent}
-        return partial(
-            self._evidence, good, bad, [at for at, one in enumerate(self.paths) if one in quiet]
-        )
+        return partial(self._evidence, basin, {})
 
     def _evidence(
-        self,
-        good: NDArray[np.float64],
-        bad: NDArray[np.float64],
-        silent: list[int],
-        first: int,
-        end: int,
+        self, basin: MatchBasin, known: dict[int, NDArray[np.float64]], first: int, end: int
     ) -> Evidence:
-        """The evidence of a range, by successes and failures of all nodes and silent paths."""
+        """The evidence of a range; `known` takes successes and failures by page of attempts."""
         keys = {"first": first + 1, "last": end}
         with reading_rows(self._database.name):
             found = self._seen(nodes, self._database.rows(_NODES, keys), _NODE_SIZES)
@@ -217,57 +203,81 @@ class MapPages:
             at, sessions = (found["key"] - 1).astype(np.int32), self._numbered(found)
             links = np.searchsorted(at, self._edges(joined)[0])
             links = links[sessions[links[:, 0]] == sessions[links[:, 1]]]
-            matched = good[at]
+            good, bad = self._fared(basin, known, found["key"])
+            visitors = self._database.rows(_VISITORS, keys)
+            silent = [
+                number
+                for (path,) in visitors
+                if (number := self._path_numbers.get(path)) is not None and self._is_silent(number)
+            ]
             if silent:
                 visited, on, _ = self.visits(first, end)
                 walked = visited[np.isin(on, silent)]
-                np.add.at(matched, np.searchsorted(at, walked), 1.0)
-        return Evidence(at, found["driven_m"], links.astype(np.int32), matched, bad[at])
+                np.add.at(good, np.searchsorted(at, walked), 1.0)
+        return Evidence(at, found["driven_m"], links.astype(np.int32), good, bad)
 
-    def _drives(self) -> Iterator[tuple[int, Attempts]]:
-        """The attempts between visible nodes of one session after another, with its number."""
-        hidden = np.array(list(self._visible.hidden_of(nodes)), np.int64)
-        for key, number in self._session_numbers.items():
-            rows = [
-                row
-                for row in verified(attempts, self._database.rows(_OF_SESSION, {"session": key}))
-                if self._visible.has(attempts, row["key"], row["revision"])
-            ]
-            rows.sort(key=lambda row: (self._visible.places[row["revision"]], row["key"]))
-            made = Attempts.joined([unpack(row["body"], row["count"]) for row in rows])
-            ends = np.stack([made.reference, made.node]).astype(np.int64)
-            seen = ((ends > 0) & (ends <= self.end) & ~np.isin(ends, hidden)).all(axis=0)
-            if seen.any():
-                made = made.rows(np.flatnonzero(seen))
-                yield number, replace(made, node=(made.node - 1).astype(np.int32))
+    def _fared(
+        self, basin: MatchBasin, known: dict[int, NDArray[np.float64]], keys: NDArray[np.int64]
+    ) -> NDArray[np.float64]:
+        """(2, n) successes, and weights of failures, of nodes with these keys (n,)."""
+        numbers, which = np.unique(page_of(keys), return_inverse=True)
+        for page in numbers.tolist():
+            if page not in known:
+                known[page] = self._fared_on(basin, page)
+        if not len(keys):
+            return np.zeros((2, 0))
+        pages = np.stack([known[page] for page in numbers.tolist()])
+        return np.ascontiguousarray(pages[which, :, (keys - 1) % ATTEMPT_PAGE].T)
 
-    @cached_property
-    def basin_counts(self) -> BasinCounts:
-        """Counts of the attempts of all drives, from which match basins are learnt."""
-        experiences = self._experiences()
-        counts = BasinCounts.empty()
-        for _, made in self._drives():
-            counts += count_attempts(
-                np.zeros(len(made), np.int64),
-                experiences[made.node],
-                made.iteration,
-                (made.along_m.astype(np.float64), made.across_m.astype(np.float64)),
-                made.sigma_m.astype(np.float64),
-                made.accepted,
+    def _fared_on(self, basin: MatchBasin, page: int) -> NDArray[np.float64]:
+        """(2, ATTEMPT_PAGE) successes, and weights of failures, of the nodes of a page."""
+        made = self._attempts_on(page)
+        rates = basin.success_rate(
+            made.along_m.astype(np.float64), made.across_m.astype(np.float64)
+        )
+        at = (made.node - 1) % ATTEMPT_PAGE
+        weights = made.accepted, np.where(made.accepted, 0.0, rates)
+        return np.stack([np.bincount(at, one, ATTEMPT_PAGE) for one in weights])
+
+    def _attempts_on(self, page: int) -> Attempts:
+        """The attempts of all sessions, one after another, on a page of nodes."""
+        rows = [
+            row
+            for row in verified(attempts, self._database.rows(_ON_PAGE, {"page": page}))
+            if self._visible.has(attempts, row["key"], row["revision"])
+            and row["session"] in self._session_numbers
+        ]
+        places = self._visible.places
+        rows.sort(
+            key=lambda row: (
+                self._session_numbers[row["session"]],
+                places[row["revision"]],
+                row["key"],
             )
-        return counts
+        )
+        made = Attempts.joined([self._between_visible(row) for row in rows])
+        here = np.flatnonzero(page_of(made.node) == page)
+        return made if len(here) == len(made) else made.rows(here)
 
-    def _experiences(self) -> NDArray[np.int64]:
-        """(end,) int64: equal for the nodes of a chain of odometry edges within a session."""
-        sessions = np.full(self.end + 1, -1, np.int64)
-        for key, revision, session in self._database.rows(_OWNERS, {}):
-            if self._visible.has(nodes, key, revision):
-                sessions[key] = session
-        rows = self._database.rows(_ALL_STEPS, {})
-        steps = [(a, b) for key, revision, a, b in rows if self._visible.has(edges, key, revision)]
-        ends = np.array(steps, np.int64).reshape(-1, 2)
-        a, b = sessions[ends].T
-        return labels_of(ends[(a == b) & (a >= 0)] - 1, self.end)
+    def _between_visible(self, row: Row) -> Attempts:
+        """The attempts of a row between visible nodes."""
+        _, made = unpack(row["body"], row["count"])
+        if not (hidden := self._visible.hidden_of(nodes)):
+            return made
+        gone = np.isin([made.reference, made.node], list(hidden))
+        return made.rows(np.flatnonzero(~gone.any(axis=0)))
+
+    def _is_silent(self, path: int) -> bool:
+        """Whether the session of a path has no attempts between visible nodes."""
+        if path not in self._silent:
+            session = self._path_sessions[path]
+            rows = self._database.rows(_OF_SESSION, {"session": session})
+            self._silent[path] = session in self._session_numbers and not any(
+                len(self._between_visible(row))
+                for row in verified(attempts, rows)
+                if self._visible.has(attempts, row["key"], row["revision"])
+            )
+        return self._silent[path]
 
     def _seen(
         self, table: Table, rows: Sequence[tuple[Any, ...]], sizes: dict[str, int]
@@ -323,12 +333,9 @@ _STEPS = select(*edges.columns).where(
     edges.c.b.between(_FIRST, _LAST),
     edges.c.kind == literal_column(f"'{EdgeKind.ODOMETRY}'"),
 )
-# Of these an index has all columns.
-_ALL_STEPS = select(edges.c.key, edges.c.revision, edges.c.a, edges.c.b).where(
-    edges.c.kind == literal_column(f"'{EdgeKind.ODOMETRY}'")
-)
-_OWNERS = select(nodes.c.key, nodes.c.revision, nodes.c.session)
 _OF_SESSION = select(*attempts.columns).where(attempts.c.session == bindparam("session"))
+_ON_PAGE = select(*attempts.columns).where(attempts.c.page == bindparam("page"))
+_VISITORS = select(path_entries.c.path).where(path_entries.c.node.between(_FIRST, _LAST)).distinct()
 _ENTRIES = select(*path_entries.columns).where(path_entries.c.node.between(_FIRST, _LAST))
 _same = path_entries.alias()
 _SAME_PLACES = (

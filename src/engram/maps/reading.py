@@ -29,7 +29,7 @@ from engram.graph.model import (
     SessionId,
 )
 from engram.graph.paths import Attempts
-from engram.maps.attempts import unpack
+from engram.maps.attempts import unpack_drive
 from engram.maps.columns import Columns, read_columns
 from engram.maps.marks import removed_measurements, without_removed
 from engram.maps.records import MapContents, Revision
@@ -324,10 +324,10 @@ def attempt_tables(
     query = view.select(attempts)
     if session is not None:
         query = query.where(attempts.c.session == session)
-    found: dict[int, list[Attempts]] = {}
+    found: dict[int, list[Row]] = {}
     for row in verified(attempts, connection.execute(query)):
-        found.setdefault(row["session"], []).append(unpack(row["body"], row["count"]))
-    return {session: Attempts.joined(tables) for session, tables in found.items()}
+        found.setdefault(row["session"], []).append(row)
+    return {session: unpack_drive(rows) for session, rows in found.items()}
 
 
 def _nodes(

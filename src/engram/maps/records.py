@@ -8,11 +8,9 @@ from enum import StrEnum
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engram.frontend.frame import DescriptorKind, FrameStatus
 from engram.geometry.cameras import CameraId, StereoCamera
-from engram.graph.basin import BasinCounts, count_attempts
 from engram.graph.model import Edge, Node, PathEntry, Session, SessionId
 from engram.graph.paths import Attempts
 
@@ -95,12 +93,14 @@ class StoredSession:
         last_entry: the newest entry of its path; None if it has none.
         next_sequence: sequence number of its next path entry.
         next_iteration: one past the newest iteration of its attempts.
+        attempts: number of its attempts.
     """
 
     nodes: tuple[Node, ...] = ()
     last_entry: PathEntry | None = None
     next_sequence: int = 0
     next_iteration: int = 0
+    attempts: int = 0
 
     @property
     def last_stamp_ns(self) -> int | None:
@@ -152,22 +152,6 @@ class MapContents:
     edges: Sequence[Edge]
     path_entries: tuple[PathEntry, ...]
     attempts: Attempts
-
-    def basin_counts(self, experiences: NDArray[np.int32]) -> BasinCounts:
-        """Counts of all remembered attempts, from which match basins are learnt.
-
-        Args:
-            experiences: (N,) experience of each of `nodes`, numbered from 0.
-        """
-        made = self.attempts
-        return count_attempts(
-            made.session.astype(np.int64),
-            experiences[made.node].astype(np.int64),
-            made.iteration,
-            (made.along_m.astype(np.float64), made.across_m.astype(np.float64)),
-            made.sigma_m.astype(np.float64),
-            made.accepted,
-        )
 
     def last_iterations(self) -> dict[SessionId, int]:
         """Newest remembered iteration by session, for sessions that have any."""

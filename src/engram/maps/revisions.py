@@ -14,9 +14,8 @@ from engram.errors import MapCorruptError, RevisionError
 from engram.files import Holder
 from engram.graph.model import EdgeKind, PathEntry, PathEntryKind, SessionId, path_id
 from engram.maps import reading
-from engram.maps.changes import Changes
 from engram.maps.content import chained, content_hash
-from engram.maps.counting import count_on
+from engram.maps.counting import count_open
 from engram.maps.records import InterruptedSession, Revision, RevisionStatus, StoredSession
 from engram.maps.rows import (
     Row,
@@ -43,7 +42,7 @@ from engram.maps.schema import (
     sessions,
     words,
 )
-from engram.maps.totals import Own, Totals, count_all, own_rows, state_at_head
+from engram.maps.totals import Own, own_rows
 from engram.maps.view import LARGEST_KEY, KeyBook, View, head, place_in_history
 
 # Number, first and last key of the rows of a revision, of one table after another: as text, since
@@ -106,7 +105,8 @@ def commit_revision(
     parent = head(connection)
     row = revision_row(connection, revision_key, was)
     contents, own = brought(connection, row)
-    totals = _count_own(connection, parent, own)
+    totals, after, before = count_open(connection, View(parent, own.key))
+    save_runs(connection, before, after)
     row |= {
         "status": str(RevisionStatus.COMMITTED),
         "number": parent + 1,
@@ -119,19 +119,6 @@ def commit_revision(
     row["chain"] = chained(connection, content_hash(connection, parent), row, own)
     _put(connection, row)
     return reading.revision_from_row(row)
-
-
-def _count_own(connection: Connection, parent: int, own: Own) -> Totals:
-    """The totals with the rows of a revision; writes the runs."""
-    before, runs = state_at_head(connection, parent)
-    view = View(parent, own.key)
-    if runs is None:
-        totals, after = count_all(connection, view)
-    else:
-        changes = Changes.between(connection, View(parent), view)
-        totals, after = count_on(connection, view, before, runs, changes)
-    save_runs(connection, runs, after)
-    return totals
 
 
 def revision_row(connection: Connection, key: int, status: RevisionStatus) -> Row:
@@ -338,6 +325,7 @@ def stored_session(connection: Connection, view: View, session: Row) -> StoredSe
         last_entry=last_entry,
         next_sequence=0 if last_entry is None else last_entry.sequence + 1,
         next_iteration=0 if made is None else int(made.iteration.max()) + 1,
+        attempts=0 if made is None else len(made),
     )
 
 

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Table, delete, insert, select
 
 from engram.graph.model import Edge
 from engram.graph.paths import Attempts
-from engram.maps.attempts import pack, unpack, words_row, write_words
+from engram.maps.attempts import pack, unpack_drive, words_row, write_words
 from engram.maps.rows import Row, edge_row, sealed, verified
 from engram.maps.schema import (
     amendments,
@@ -73,20 +73,25 @@ class RowBuffer:
 
     Attributes:
         rows: by table, in order of writing, but for edges, words and attempts.
+        written_attempts: number of attempts that the revision has already, by key of the session.
         size_bytes: approximate size of the buffer in memory.
     """
 
     def __init__(self, keys: KeyBook, revision_key: int) -> None:
         self._keys = keys
         self._revision_key = revision_key
+        self._attempts: dict[int, list[Attempts]] = defaultdict(list)
+        self.written_attempts: dict[int, int] = defaultdict(int)
         self.clear()
 
     def clear(self) -> None:
-        """Discards all rows."""
+        """Discards all rows, since they are written or unwanted."""
         self.rows: dict[Table, list[Row]] = {table: [] for table in _TABLES}
         self._edges: dict[tuple[int, int, str], Row] = {}
         self._words: dict[int, Row] = {}
-        self._attempts: dict[int, list[Attempts]] = defaultdict(list)
+        for session, tables in self._attempts.items():
+            self.written_attempts[session] += sum(map(len, tables))
+        self._attempts.clear()
         self.size_bytes = 0
 
     def new(self, table: Table, size_bytes: int = 0, **values: Any) -> int:
@@ -133,22 +138,25 @@ class RowBuffer:
             connection.execute(upsert(edges, key), list(self._edges.values()))
         write_words(connection, list(self._words.values()))
         for session, tables in self._attempts.items():
-            self._write_attempts(connection, session, tables)
+            first = self.written_attempts[session]
+            self._write_attempts(connection, session, Attempts.joined(tables), first)
 
     def repack_attempts(self, connection: Connection, own: Own) -> None:
         """Packs attempts of all checkpoints together, so that the file does not depend on them."""
         written = own.rows(attempts)
         found = connection.execute(select(attempts).where(written).order_by(attempts.c.key))
-        tables: dict[int, list[Attempts]] = defaultdict(list)
+        bodies: dict[int, list[Row]] = defaultdict(list)
         for row in verified(attempts, found):
-            tables[row["session"]].append(unpack(row["body"], row["count"]))
+            bodies[row["session"]].append(row)
         connection.execute(delete(attempts).where(written))
-        for session, made in tables.items():
-            self._write_attempts(connection, session, made)
+        for session, rows in bodies.items():
+            self._write_attempts(connection, session, unpack_drive(rows), 0)
 
-    def _write_attempts(self, connection: Connection, session: int, tables: list[Attempts]) -> None:
+    def _write_attempts(
+        self, connection: Connection, session: int, made: Attempts, first: int
+    ) -> None:
         rows = []
-        for count, body in pack(Attempts.joined(tables)):
+        for packed in pack(made, first):
             row = {"key": self._keys.next(attempts), "revision": self._revision_key}
-            rows.append(sealed(attempts, {**row, "session": session, "count": count, "body": body}))
+            rows.append(sealed(attempts, {**row, "session": session, **packed}))
         connection.execute(insert(attempts), rows)

@@ -140,6 +140,24 @@ class Runs:
         ends_at = np.append(begins[1:], len(self.first))[: len(begins)] - 1
         return Runs(self.first[begins], self.last[ends_at], experience[begins], component[begins])
 
+    def regrouped(self, after: Runs) -> list[tuple[int, int]]:
+        """First and last node of the runs whose experience has other nodes than `after` says.
+
+        Nodes that only one of them has do not count.
+        """
+        starts = np.unique(np.concatenate([self.first, after.first]))
+        ours, theirs = self.find(starts), after.find(starts)
+        both = (ours >= 0) & (theirs >= 0)
+        pairs = np.column_stack([self.experience[ours[both]], after.experience[theirs[both]]])
+        pairs = np.unique(pairs, axis=0)
+        repeated = [
+            np.isin(column, names[counts > 1])
+            for column in pairs.T
+            for names, counts in [np.unique(column, return_counts=True)]
+        ]
+        rows = np.isin(self.experience, pairs[np.any(repeated, axis=0), 0])
+        return list(zip(self.first[rows].tolist(), self.last[rows].tolist(), strict=True))
+
     def changes(self, after: Runs) -> tuple[Keys, Runs]:
         """Keys of the rows that `after` has not or otherwise, and its rows to write instead."""
         ours, theirs = (np.column_stack(one._arrays()) for one in (self, after))

@@ -204,9 +204,11 @@ attempts = _table(
     _key(),
     _int("revision"),
     _int("session"),
+    _int("page", "of their nodes: from key 128 · page + 1 on"),
     _int("count"),
     _bytes("body", "packed, below"),
     Index("attempts_by_session", "session"),
+    Index("attempts_by_page", "page"),
 )
 
 statistics = _table(

@@ -1,7 +1,8 @@
 """What is visible as of a revision, in numbers: counted on from those of the revision before.
 
 A revision that only adds is counted by its own rows. One that hides, removes, moves or supersedes
-is counted with the whole map, in stretches of its rows.
+is counted with the whole map, in stretches of its rows. So is one whose edges join experiences of
+earlier revisions, since attempts on these then count otherwise.
 """
 
 from __future__ import annotations
@@ -17,11 +18,13 @@ from sqlalchemy import ColumnElement, Connection, Select, Table, and_, func, or_
 
 from engram.errors import MapCorruptError
 from engram.geometry.cameras import CameraId
+from engram.graph.basin import BIN_COUNT, BasinCounts, count_attempts
 from engram.graph.model import EdgeKind
+from engram.graph.paths import Attempts
+from engram.maps.attempts import unpack
 from engram.maps.columns import Columns, read_columns
 from engram.maps.marks import counting
-from engram.maps.reading import descriptor_of, load_cameras
-from engram.maps.records import MapInfo
+from engram.maps.reading import load_cameras
 from engram.maps.rows import Row, verified
 from engram.maps.runs import Keys, Runs, load_runs
 from engram.maps.schema import (
@@ -43,6 +46,8 @@ _NODE_BYTES = {"uuid": 16, "landmark_hash": 16}
 _AT_ONCE = 100_000
 
 _Key = Annotated[int, msgspec.Meta(ge=0, le=LARGEST_KEY)]
+_Bins = Annotated[tuple[_Key, ...], msgspec.Meta(min_length=BIN_COUNT, max_length=BIN_COUNT)]
+Bins = tuple[_Bins, _Bins, _Bins, _Bins]
 Forward = Mapping[CameraId, tuple[float, float, float]]
 
 
@@ -60,6 +65,7 @@ class Totals:
         forward: sum of the translations of the odometry edges of each camera, metres: where it
             looks.
         right_m: largest x of a stored place in the map frame; None if there is none.
+        basin: `basin_counts`: attempts along and across, then successes along and across.
     """
 
     cameras: tuple[CameraId, ...] = ()
@@ -75,6 +81,7 @@ class Totals:
     largest_component: int = 0
     forward: Forward = field(default_factory=dict)
     right_m: float | None = None
+    basin: Bins = ((0,) * BIN_COUNT,) * 4
 
     @staticmethod
     def from_json(text: str, what: str) -> Totals:
@@ -87,6 +94,17 @@ class Totals:
     def to_json(self) -> str:
         """As stored."""
         return msgspec.json.encode(self, order="sorted").decode()
+
+    @property
+    def basin_counts(self) -> BasinCounts:
+        """Counts of the attempts between visible nodes, from which match basins are learnt."""
+        counts = np.array(self.basin, np.int64)
+        return BasinCounts(counts[:2], counts[2:])
+
+    def with_basin(self, counts: BasinCounts) -> Totals:
+        """With other counts of attempts."""
+        (a, b), (c, d) = (map(tuple, one.tolist()) for one in (counts.attempts, counts.successes))
+        return replace(self, basin=(a, b, c, d))
 
     def agrees(self, other: Totals) -> bool:
         """Whether they are equal, but for the rounding of sums and of places."""
@@ -159,29 +177,6 @@ def totals_at(connection: Connection, number: int) -> Totals:
     return Totals.from_json(row["totals"], f"revision {number}")
 
 
-def totals_of(connection: Connection, view: View) -> Totals:
-    """The totals of a view: as stored, but for an open revision, of which all is counted."""
-    return totals_at(connection, view.at) if view.own is None else count_all(connection, view)[0]
-
-
-def info(connection: Connection, view: View, *, size_bytes: int) -> MapInfo:
-    """Counts and sizes of the map."""
-    found = totals_of(connection, view)
-    return MapInfo(
-        revision=view.at,
-        descriptor=descriptor_of(connection, view),
-        cameras=len(found.cameras),
-        sessions=found.sessions,
-        nodes=found.nodes,
-        edges=sum(found.edges.values()),
-        edges_of_kind={str(kind): found.edges[kind] for kind in EdgeKind if kind in found.edges},
-        path_entries=found.path_entries,
-        attempts=found.attempts,
-        mapped_m=found.mapped_m,
-        size_bytes=size_bytes,
-    )
-
-
 def state_at_head(connection: Connection, head: int) -> tuple[Totals, Runs | None]:
     """The totals and runs as of the newest revision; None for runs that do not fit."""
     totals, runs = totals_at(connection, head), load_runs(connection)
@@ -202,6 +197,13 @@ def count_all(connection: Connection, view: View) -> tuple[Totals, Runs]:
         attempts=int(connection.execute(seen).scalar() or 0),
         right_m=right_m_of(connection, view),
     )
+    found, runs = _count_graph(connection, view, found)
+    return found.with_basin(_basin(connection, view, runs)), runs
+
+
+def _count_graph(connection: Connection, view: View, before: Totals) -> tuple[Totals, Runs]:
+    """The totals with all edges and nodes of a view, and its runs."""
+    found = before
     known = [
         (part["key"], part["session"], part["camera"])
         for part in _stretches(connection, view, nodes, _NODE_BYTES)
@@ -213,6 +215,37 @@ def count_all(connection: Connection, view: View) -> tuple[Totals, Runs]:
         part = stretch.rows(np.flatnonzero(~np.isin(stretch["key"], skipped)))
         found, runs = with_edges(found, part, owners), runs.joined(*joints(part, owners))
     return found.of_runs(runs), runs
+
+
+def runs_of(connection: Connection, view: View) -> Runs:
+    """The runs of a view, from all its rows."""
+    return _count_graph(connection, view, Totals())[1]
+
+
+def _basin(connection: Connection, view: View, runs: Runs) -> BasinCounts:
+    """Counts of all attempts of a view, one session after another."""
+    drives = view.select(attempts).with_only_columns(attempts.c.session).distinct().order_by(None)
+    counts = BasinCounts.empty()
+    for session in connection.execute(drives).scalars().all():
+        query = view.select(attempts).where(attempts.c.session == session)
+        counts += basin_of(list(verified(attempts, connection.execute(query))), runs)
+    return counts
+
+
+def basin_of(rows: Sequence[Row], runs: Runs) -> BasinCounts:
+    """Counts of one session's attempts, of rows of `attempts`, at nodes that are in runs."""
+    made = Attempts.joined([unpack(row["body"], row["count"])[1] for row in rows])
+    at = runs.find(np.asarray(made.node, np.int64))
+    seen = np.flatnonzero(at >= 0)
+    made = made.rows(seen)
+    return count_attempts(
+        np.zeros(len(made), np.int64),
+        runs.experience[at[seen]],
+        made.iteration,
+        (made.along_m.astype(np.float64), made.across_m.astype(np.float64)),
+        made.sigma_m.astype(np.float64),
+        made.accepted,
+    )
 
 
 def _cameras(connection: Connection, *rows: Select[Any]) -> tuple[CameraId, ...]:

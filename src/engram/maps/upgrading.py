@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -18,15 +19,19 @@ from sqlalchemy import Connection, MetaData, Table, func, insert, select, text
 
 from engram.errors import MapCorruptError, MapError, MapLockedError
 from engram.files import WriterLock, draft_folder
+from engram.graph.paths import Attempts
+from engram.maps.attempts import COLUMNS, pack, unpack, unpack_drive
 from engram.maps.changes import Changes
 from engram.maps.content import EMPTY_HASH, Identities, chained
 from engram.maps.counting import count_on
 from engram.maps.map_files import log_problems
-from engram.maps.rows import Row, sealed, to_json, verified
+from engram.maps.rows import Row, from_json, sealed, to_json, verified
 from engram.maps.runs import Runs, save_runs
 from engram.maps.schema import (
     FORMAT_VERSION,
     VERSIONED,
+    attempts,
+    hidden,
     map_format,
     metadata,
     place_blocks,
@@ -38,9 +43,10 @@ from engram.maps.totals import Own, Totals
 from engram.maps.view import LARGEST_KEY, View
 from engram.sqlite import SqliteFile, is_full
 
-_NEW_COLUMNS = ("ranges", "totals", "chain")
+_NEW_COLUMNS = {revisions: ("ranges", "totals", "chain"), attempts: ("page",)}
 _NEW_TABLES = (runs, place_blocks)
-_OLD_NAME = "revisions_6"
+# Tables whose rows are written again, and what they are called meanwhile.
+_REWRITTEN = {table: f"{table.name}_6" for table in (revisions, attempts, hidden)}
 # How long to wait for a process that is just closing the map.
 _PATIENCE_MS = 1000
 
@@ -50,7 +56,8 @@ def _format_6() -> MetaData:
     old = MetaData()
     for table in metadata.sorted_tables:
         if table not in _NEW_TABLES:
-            kept = [one for one in table.columns if one.name not in _NEW_COLUMNS]
+            new = _NEW_COLUMNS.get(table, ())
+            kept = [one for one in table.columns if one.name not in new]
             Table(table.name, old, *(one._copy() for one in kept))
     return old
 
@@ -168,15 +175,23 @@ def _without_log(connection: sqlite3.Connection) -> None:
 
 def _convert(connection: Connection, file: SqliteFile) -> int:
     """Adds what format 7 has; returns the number of revisions."""
-    connection.execute(text(f"ALTER TABLE {revisions.name} RENAME TO {_OLD_NAME}"))
+    for table, name in _REWRITTEN.items():
+        for index in table.indexes:
+            connection.execute(text(f"DROP INDEX IF EXISTS {index.name}"))
+        connection.execute(text(f"ALTER TABLE {table.name} RENAME TO {name}"))
     metadata.create_all(connection)
-    for table in metadata.sorted_tables:
+    more = _copy_hidden(connection, _split_attempts(connection))
+    for row in _old_rows(connection, revisions):
+        row |= {"ranges": "{}", "totals": "{}", "chain": ""}
+        if row["key"] in more:
+            contents = from_json(row["contents"], f"contents of revision {row['number']}")
+            row["contents"] = to_json(contents | {hidden.name: more[row["key"]]})
+        connection.execute(insert(revisions), sealed(revisions, row))
+    for name in _REWRITTEN.values():
+        connection.execute(text(f"DROP TABLE {name}"))
+    for table in metadata.sorted_tables:  # in what those leave free
         for index in table.indexes:
             index.create(connection, checkfirst=True)
-    for row in _old_rows(connection):
-        row |= {"ranges": "{}", "totals": "{}", "chain": ""}
-        connection.execute(insert(revisions), sealed(revisions, row))
-    connection.execute(text(f"DROP TABLE {_OLD_NAME}"))
     count = complete_history(connection)
     write_format(connection)
     file.mark(connection.exec_driver_sql)
@@ -206,9 +221,48 @@ def _put(connection: Connection, rows: list[Row]) -> None:
         connection.execute(revisions.update().where(revisions.c.key == row["key"]).values(row))
 
 
-def _old_rows(connection: Connection) -> list[Row]:
-    old = _FORMAT_6.metadata.tables[revisions.name].to_metadata(MetaData(), name=_OLD_NAME)
-    return list(verified(old, connection.execute(select(old).order_by(old.c.key))))
+def _old_rows(connection: Connection, table: Table) -> Iterator[Row]:
+    """The rows of a table that is written again."""
+    old = _FORMAT_6.metadata.tables[table.name].to_metadata(MetaData(), name=_REWRITTEN[table])
+    keys = connection.execute(select(old.c.key).order_by(old.c.key)).scalars().all()
+    for key in keys:
+        yield from verified(old, connection.execute(select(old).where(old.c.key == key)))
+
+
+def _split_attempts(connection: Connection) -> dict[int, list[int]]:
+    """Writes the attempts by page; returns the new keys of each old body."""
+    found: dict[int, list[int]] = {}
+    places: Counter[tuple[int, int]] = Counter()
+    key = 0
+    for row in _old_rows(connection, attempts):
+        _, made = unpack(row["body"], row["count"])
+        drive = row["revision"], row["session"]
+        bodies = pack(made, places[drive])
+        places[drive] += len(made)
+        found[row["key"]] = list(range(key + 1, key + 1 + len(bodies)))
+        for one in bodies:
+            key += 1
+            new = {"key": key, "revision": row["revision"], "session": row["session"]}
+            connection.execute(insert(attempts), sealed(attempts, new | one))
+    return found
+
+
+def _copy_hidden(connection: Connection, bodies: Mapping[int, list[int]]) -> dict[int, int]:
+    """Writes the rows that hide others; returns their number by revision.
+
+    Args:
+        connection: of the draft.
+        bodies: new keys of each old body of attempts.
+    """
+    key, counts = 0, Counter[int]()
+    for row in _old_rows(connection, hidden):
+        target = row["target"]
+        targets = bodies.get(target, []) if row["record"] == attempts.name else [target]
+        for one in targets:
+            key += 1
+            connection.execute(insert(hidden), sealed(hidden, row | {"key": key, "target": one}))
+        counts[row["revision"]] += len(targets)
+    return dict(counts)
 
 
 Ranges = Mapping[int, Mapping[str, tuple[int, int]]]
@@ -254,23 +308,63 @@ def _count(connection: Connection, rows: list[Row], ranges: Ranges) -> None:
 def _compare(source: sqlite3.Connection, made: sqlite3.Connection) -> int:
     """Compares all that both formats have, row by row; returns the number of rows.
 
+    Attempts are compared drive by drive, and of rows that hide others all but those of attempts.
+
     Raises:
         MapCorruptError: something differs.
     """
-    compared = 0
+    compared = _compare_attempts(source, made)
     for table in _FORMAT_6.metadata.sorted_tables:
-        if table.name == map_format.name:
+        if table.name in {map_format.name, attempts.name}:
             continue
-        kept = [
-            one.name
-            for one in table.columns
-            if table.name != revisions.name or one.name != "checksum"
-        ]
-        query = f"SELECT {', '.join(kept)} FROM {table.name} ORDER BY 1"
+        left_out = _NOT_COMPARED.get(table.name, set())
+        kept = ", ".join(one.name for one in table.columns if one.name not in left_out)
+        which = f"WHERE record != '{attempts.name}'" if table.name == hidden.name else ""
+        order = "key" if "key" in table.c else "1"
+        query = f"SELECT {kept} FROM {table.name} {which} ORDER BY {order}"
         for old, new in zip(source.execute(query), made.execute(query), strict=True):
             compared += 1
             if old != new:
                 raise MapCorruptError(f"table {table.name}: row {old[0]} came out otherwise")
+    return compared
+
+
+_NOT_COMPARED = {revisions.name: {"checksum", "contents"}, hidden.name: {"key", "checksum"}}
+
+
+_DRIVES = "SELECT DISTINCT revision, session FROM attempts ORDER BY revision, session"
+_HIDDEN_DRIVES = (
+    "SELECT DISTINCT h.revision, h.hidden, a.revision, a.session FROM hidden h "
+    "JOIN attempts a ON a.key = h.target WHERE h.record = 'attempts' ORDER BY 1, 2, 3, 4"
+)
+_BODIES = (
+    "SELECT revision, count, body FROM attempts WHERE revision = ? AND session = ? ORDER BY key"
+)
+
+
+def _compare_attempts(source: sqlite3.Connection, made: sqlite3.Connection) -> int:
+    """Compares the attempts of each drive and revision; returns the number of old rows.
+
+    Raises:
+        MapCorruptError: they differ.
+    """
+    for query in (_DRIVES, _HIDDEN_DRIVES):
+        if source.execute(query).fetchall() != made.execute(query).fetchall():
+            raise MapCorruptError("table attempts: other drives have attempts than before")
+    compared = 0
+    for drive in source.execute(_DRIVES).fetchall():
+        before, after = (
+            [dict(zip(("revision", "count", "body"), row, strict=True)) for row in rows]
+            for rows in (one.execute(_BODIES, drive).fetchall() for one in (source, made))
+        )
+        compared += len(before)
+        old = Attempts.joined([unpack(row["body"], row["count"])[1] for row in before])
+        new = unpack_drive(after)
+        if old.policies != new.policies or any(
+            getattr(old, name).tobytes() != getattr(new, name).tobytes()
+            for name in (*COLUMNS, "policy")
+        ):
+            raise MapCorruptError(f"table attempts: those of row {drive[1]} came out otherwise")
     return compared
 
 

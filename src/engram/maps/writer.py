@@ -138,6 +138,9 @@ class RevisionWriter:
         self._keys = keys
         self._rows = RowBuffer(keys, view.own)
         self._known = References(database, keys, view, self._rows)
+        if drive is not None and stored is not None:
+            key, *_ = self._known.sessions[drive.session.id.bytes]
+            self._rows.written_attempts[key] = stored.attempts
         self._frames = frame_reader
         self._view = view
         self._revision_key = view.own
@@ -324,7 +327,7 @@ class RevisionWriter:
         self._checkpoint_if_due()
 
     def add_attempts(self, made: Sequence[Attempt]) -> None:
-        """Stores match attempts (method §3.5) of the drive being mapped, rounded to 18 bytes each.
+        """Stores match attempts (method §3.5) of the drive being mapped, rounded to 20 bytes each.
 
         Offsets and headings keep 11 bits, standard deviations are exact to 3 %, ranks end at 255.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
@@ -15,10 +15,6 @@ from engram.graph.graph import ExperienceGraph, labels_of
 from engram.graph.model import PathId, path_id
 from engram.graph.pages import PAGE
 from engram.graph.paths import Attempts, Evidence, PathMemory
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_matrix
-
 
 # Match probability of a node without evidence.
 UNKNOWN_BASE = 0.4
@@ -168,10 +164,20 @@ def _shared(
     config: LessonsConfig,
 ) -> NDArray[np.float64]:
     """(N,) float64: probability by successes and failures, (N,) each, shared along experiences."""
-    sharing = _sharing(driven_m, experiences, config)
-    good, bad = sharing @ good, sharing @ bad
+    in_line = np.lexsort((np.arange(len(driven_m)), driven_m, experiences))
+    own = np.stack([good, bad])
+    shared = own.copy()
+    for step in range(1, config.pool_nodes + 1):
+        a, b = in_line[:-step], in_line[step:]
+        apart_m = driven_m[b] - driven_m[a]
+        near = (experiences[a] == experiences[b]) & (apart_m <= config.pool_reach_m)
+        if not near.any():
+            break
+        a, b, weight = a[near], b[near], np.exp(-apart_m[near] / config.pool_m)
+        shared[:, a] += weight * own[:, b]
+        shared[:, b] += weight * own[:, a]
     prior, unknown = config.base_attempts, config.unknown_base
-    return np.asarray((good + prior * unknown) / (good + bad + prior))
+    return np.asarray((shared[0] + prior * unknown) / (shared[0] + shared[1] + prior))
 
 
 def _counts(
@@ -191,26 +197,3 @@ def _counts(
     walked = [graph.index(one.node) for path in silent for one in path_memory.entries(path)]
     np.add.at(good, np.array(walked, np.int64), 1.0)
     return good, bad
-
-
-def _sharing(
-    driven_m: NDArray[np.float64], experiences: NDArray[np.integer], config: LessonsConfig
-) -> csr_matrix:
-    """(N, N) weight of each node's evidence at the other nodes of its experience."""
-    from scipy.sparse import coo_matrix
-
-    count = len(driven_m)
-    in_line = np.lexsort((np.arange(count), driven_m, experiences))
-    rows, columns, weights = [np.arange(count)], [np.arange(count)], [np.ones(count)]
-    for step in range(1, config.pool_nodes + 1):
-        a, b = in_line[:-step], in_line[step:]
-        apart_m = driven_m[b] - driven_m[a]
-        near = (experiences[a] == experiences[b]) & (apart_m <= config.pool_reach_m)
-        if not near.any():
-            break
-        weight = np.exp(-apart_m[near] / config.pool_m)
-        rows += [a[near], b[near]]
-        columns += [b[near], a[near]]
-        weights += [weight, weight]
-    at = (np.concatenate(rows), np.concatenate(columns))
-    return coo_matrix((np.concatenate(weights), at), (count, count)).tocsr()

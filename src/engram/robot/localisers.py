@@ -149,7 +149,7 @@ def _by_pages(opened: Map, focal_px: float, config: LocaliserConfig) -> _Known:
 def _past_drives(
     opened: Map, focal_px: float, config: BasinConfig
 ) -> tuple[MatchBasin, Callable[[int, int], Evidence]]:
-    basin = MatchBasin.of(focal_px, opened.pages.basin_counts, config)
+    basin = MatchBasin.of(focal_px, opened.totals().basin_counts, config)
     return basin, opened.pages.evidence(basin)
 
 

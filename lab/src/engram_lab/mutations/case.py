@@ -365,7 +365,8 @@ def packed_attempts(value: bytes, chance: random.Random) -> bytes:
     content: dict[str, Any] = msgspec.msgpack.decode(value)
     match chance.randrange(6):
         case 0:
-            content["base"] = chance.choice([2**61, -(2**61), 2**62, 2**63 - 1])
+            name = chance.choice(["base", "first"])
+            content[name] = chance.choice([2**61, -(2**61), 2**62, 2**63 - 1])
         case 1:
             content["policies"] = chance.choice([[], ["\x1b[31m"], ["x"] * 100_000])
         case 2:

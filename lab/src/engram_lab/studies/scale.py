@@ -241,9 +241,9 @@ class _Rows:
                 sequence += 1
         tried = self._tried[lane % len(self._tried)]
         moved = replace(tried, reference=tried.reference + first, node=tried.node + first)
-        for count, body in pack(moved):
+        for packed in pack(moved):
             row = {"key": self._next(schema.attempts), "revision": revision, "session": session}
-            self._put(schema.attempts, **row, count=count, body=body)
+            self._put(schema.attempts, **row, **packed)
 
     def _node(self, revision: int, session: int, street: int, lane: int, metre: int) -> int:
         city = self._city

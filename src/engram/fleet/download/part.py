@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from engram.errors import InputError
 from engram.geometry.se3 import SE3, propagate_covariance
-from engram.graph.basin import BasinCounts
 from engram.graph.clock import hour_of_day, zone_note
 from engram.graph.graph import ExperienceGraph, Links
 from engram.graph.model import (
@@ -163,12 +162,6 @@ class Stock:
             node=node[made.node],
         )
         return attempts.rows(np.argsort(attempts.session, kind="stable"))
-
-    @cached_property
-    def basin_counts(self) -> BasinCounts:
-        """Counts from which match basins are learnt."""
-        places = [self.graph.index(node.id) for node in self.contents.nodes]
-        return self.contents.basin_counts(self.graph.experiences[places])
 
     @cached_property
     def sizes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
