@@ -24,6 +24,8 @@ from engram.errors import (
     SequenceError,
     StorageFullError,
 )
+from engram.frontend.frame import Landmarks
+from engram.frontend.ranked import RankedLandmarks
 from engram.geometry.se3 import SE3, propagate_covariance
 from engram.graph.model import Clock
 from engram.odometry.step import OdometryStatus
@@ -79,6 +81,68 @@ def test_what_is_written_is_read_back_bit_for_bit(tmp_path: Path) -> None:
         "framelog",
     )
     assert log.first_pair_hash == pair_hash(0)
+
+
+def ranked(index: int) -> RankedLandmarks:
+    """A frame's landmarks with every second one of them again, of later ranks."""
+    own = logged(index).frame.landmarks
+    count = len(own)
+    more = Landmarks(*(getattr(own, name)[::2] for name in Landmarks.__slots__))
+    places = np.random.default_rng(index).permutation(count + len(more))
+    ranks = np.empty(len(places), np.uint16)
+    ranks[np.sort(places[:count])] = 3 * np.random.default_rng(7).permutation(count)
+    ranks[np.sort(places[count:])] = 3 * count + np.arange(len(more))
+    return RankedLandmarks.joined(own, more, ranks)
+
+
+def write_ranked(path: Path) -> Path:
+    with FrameLogWriter(path, log_header()) as writer:
+        for index in range(PAIRS):
+            writer.append(logged(index), pair_hash(index), ranked(index))
+    return path
+
+
+def test_further_landmarks_are_kept_beside_the_frame_s_own(tmp_path: Path) -> None:
+    path = write_ranked(tmp_path / "a.framelog")
+    log, fewer = FrameLog(path), FrameLog(path, landmarks=4)
+    for index in range(PAIRS):
+        assert_same_frame(log.read(index), logged(index))
+        found, wanted = log.ranked(index), ranked(index)
+        assert found is not None
+        np.testing.assert_array_equal(found.ranks, wanted.ranks)
+        for name in Landmarks.__slots__:
+            chosen, first = (getattr(one, name) for one in (found.landmarks, wanted.landmarks))
+            np.testing.assert_array_equal(chosen, first)
+        assert len(fewer.read(index).frame.landmarks) == len(wanted.first(4)) > 0
+    assert FrameLog(write_log(tmp_path / "b.framelog")).ranked(0) is None
+
+
+def test_landmarks_of_a_frame_that_leaves_some_out_are_not_kept(tmp_path: Path) -> None:
+    own = logged(0).frame.landmarks
+    rest = Landmarks(*(getattr(own, name)[1:] for name in Landmarks.__slots__))
+    frame = replace(logged(0).frame, landmarks=rest, left_out=1)
+    with FrameLogWriter(tmp_path / "a.framelog", log_header()) as writer:
+        writer.append(replace(logged(0), frame=frame), pair_hash(0), ranked(0))
+    assert FrameLog(tmp_path / "a.framelog").ranked(0) is None
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        "UPDATE more SET ranks = zeroblob(length(ranks)) WHERE number = 2",
+        "UPDATE more SET landmarks = (SELECT landmarks FROM frames WHERE number = 1)",
+        "UPDATE more SET number = number + 10 WHERE number = 2; "
+        "UPDATE more SET number = 2 WHERE number = 3",
+    ],
+)
+def test_damaged_further_landmarks_are_named(tmp_path: Path, damage: str) -> None:
+    path = write_ranked(tmp_path / "a.framelog")
+    with closing(sqlite3.connect(path)) as connection:
+        connection.executescript(damage)
+    log = FrameLog(path)
+    assert_same_frame(log.read(2), logged(2))
+    with pytest.raises(MapCorruptError, match="frame 2 of the frame log: its further landmarks"):
+        log.ranked(2)
 
 
 def test_a_finished_log_is_one_file(tmp_path: Path) -> None:
@@ -327,7 +391,7 @@ def test_a_newer_format_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "hostile",
     [
-        "CREATE VIEW more AS WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n FROM r) "
+        "CREATE VIEW others AS WITH RECURSIVE r(n) AS (SELECT 1 UNION ALL SELECT n FROM r) "
         "SELECT * FROM r",
         "CREATE TRIGGER t AFTER UPDATE ON log BEGIN DELETE FROM frames; END",
         "DROP TABLE frames",

@@ -19,6 +19,7 @@ from engram.errors import ConfigError, SequenceError, UnfitDriveError
 from engram.files import check_parent
 from engram.frontend.features import feature_kind
 from engram.frontend.frame import DescriptorKind, Frame, FrameStatus
+from engram.frontend.ranked import ranked_landmarks
 from engram.geometry.cameras import StereoCamera
 from engram.graph.model import Session
 from engram.keywords import keywords
@@ -447,6 +448,7 @@ def extract_log(
     out: Path,
     settings: Settings,
     monitor: Monitor = QUIET,
+    most_landmarks: int = 0,
 ) -> ExtractReport:
     """Runs a drive's images through front-end and odometry and records the result.
 
@@ -456,6 +458,8 @@ def extract_log(
     Args:
         out: NAME.framelog.
         monitor: receives the status of each frame, and may stop the recording.
+        most_landmarks: of each frame that the log keeps, in the front-end's order, beyond those
+            that it has; 0 for none.
     """
     report = ExtractReport(str(out))
     front = Front(settings)
@@ -476,7 +480,10 @@ def extract_log(
                     report.already_recorded += 1
                     monitor.advance("recorded already")
                 else:
-                    writer.append(LoggedFrame(frame, step), pair_hash)
+                    ranked = None
+                    if most_landmarks:
+                        ranked = ranked_landmarks(pair, settings.frontend, most_landmarks)
+                    writer.append(LoggedFrame(frame, step), pair_hash, ranked)
                     report.frames += 1
                     monitor.advance(step.status.value)
                 monitor.check()

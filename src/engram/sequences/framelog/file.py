@@ -36,6 +36,7 @@ from engram.frontend.blobs import (
 )
 from engram.frontend.features import feature_kind
 from engram.frontend.frame import DescriptorKind, Frame, FrameStatus
+from engram.frontend.ranked import RankedLandmarks
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram.graph.clock import check_longitude, is_zone_name
@@ -87,10 +88,23 @@ frames_table = Table(
 )
 
 
+# One row for each frame of which more landmarks are kept than it has: those, and the ranks (uint16,
+# little-endian) of both in the order of `RankedLandmarks`. `digest` ties them to the frame.
+more_table = Table(
+    "more",
+    metadata,
+    Column("number", _INT64, primary_key=True, autoincrement=False),
+    Column("ranks", LargeBinary(), nullable=False),
+    Column("landmarks", LargeBinary(), nullable=False),
+    Column("digest", LargeBinary(), nullable=False),
+    sqlite_strict=True,
+)
+
+
 FRAME_LOG = FileKind(
     noun="frame log",
     application_id=0x456E464C,  # "EnFL"
-    format_version=2,
+    format_version=3,
     metadata=metadata,
     strange=SequenceError,
     cure="restore a copy or record it again",
@@ -378,6 +392,49 @@ def decode_frame(
         )
     except MapCorruptError as error:
         raise MapCorruptError(f"frame {step.number} of the frame log: {error}") from error
+
+
+def encode_more(
+    row: dict[str, Any], frame: Frame, ranked: RankedLandmarks
+) -> dict[str, Any] | None:
+    """The row of the further landmarks of a frame.
+
+    Args:
+        row: `encode_row` of the frame.
+
+    Returns:
+        None where the first of them are not the frame's: some of it were left out.
+    """
+    own, more = ranked.parted(len(frame.landmarks))
+    if encode_landmarks(own, frame.camera) != row["landmarks"]:
+        return None
+    values = {
+        "number": row["number"],
+        "ranks": ranked.ranks.astype("<u2").tobytes(),
+        "landmarks": encode_landmarks(more, frame.camera),
+    }
+    return {**values, "digest": _more_digest(values, row["digest"])}
+
+
+def decode_more(row: Any, step_digest: bytes, frame: Frame) -> RankedLandmarks:
+    """A row of `more_table`, and the frame that it belongs to."""
+    values = dict(row._mapping)
+    try:
+        if not all(isinstance(values[name], bytes) for name in ("ranks", "landmarks", "digest")):
+            raise ValueError("is not of its types")
+        if _more_digest(values, step_digest) != values["digest"]:
+            raise ValueError("do not match their hash")
+        more = decode_landmarks(values["landmarks"], frame.camera, frame.descriptor)
+        ranks = np.frombuffer(values["ranks"], dtype="<u2").astype(np.uint16)
+        return RankedLandmarks.joined(frame.landmarks, more, ranks)
+    except (ValueError, MapCorruptError) as error:
+        raise MapCorruptError(
+            f"frame {values['number']} of the frame log: its further landmarks: {error}"
+        ) from error
+
+
+def _more_digest(values: dict[str, Any], step_digest: bytes) -> bytes:
+    return content_digest(step_digest + values["ranks"] + values["landmarks"][:HASH_BYTES])
 
 
 def _checked(thumbnail: bytes) -> bytes:

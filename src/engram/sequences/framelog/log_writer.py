@@ -20,10 +20,12 @@ from sqlalchemy import Connection, func, insert, select, update
 from engram import __version__
 from engram.errors import IncompatibleError, InputError, MapCorruptError, MapError, SequenceError
 from engram.frontend.blobs import content_digest
+from engram.frontend.ranked import RankedLandmarks
 from engram.sequences.framelog.file import (
     FrameLogHeader,
     begin_writing,
     decisions_table,
+    encode_more,
     encode_row,
     fold_log_in,
     framelog_file,
@@ -32,6 +34,7 @@ from engram.sequences.framelog.file import (
     log_digest,
     log_table,
     log_while_writing,
+    more_table,
     report_table,
 )
 from engram.sequences.framelog.reader import read_header
@@ -83,13 +86,16 @@ class FrameLogWriter:
         """Stamp of the last frame in the log; None while it is empty."""
         return self._last_stamp_ns
 
-    def append(self, logged: LoggedFrame, pair_hash: str) -> None:
+    def append(
+        self, logged: LoggedFrame, pair_hash: str, ranked: RankedLandmarks | None = None
+    ) -> None:
         """Record the next frame.
 
         Args:
             logged: the frame, of the header's camera, front-end and descriptor kind.
             pair_hash: `first_pair_hash` of its images, for the identity of sessions that begin
                 with this frame.
+            ranked: its landmarks and further ones, not kept where some of its own were left out.
         """
         frame, header = logged.frame, self._header
         for name in ("camera", "descriptor", "frontend"):
@@ -101,8 +107,11 @@ class FrameLogWriter:
                 f"({self._last_stamp_ns} ns)"
             )
         row = encode_row(self._recorded, logged, pair_hash)
+        more = None if ranked is None else encode_more(row, frame, ranked)
         with self._or_abandon() as connection:
             connection.execute(insert(frames_table), row)
+            if more is not None:
+                connection.execute(insert(more_table), more)
         self._recorded += 1
         self._last_stamp_ns = frame.stamp_ns
         self._since_checkpoint += 1

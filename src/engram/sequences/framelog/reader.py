@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, select
 
 from engram.errors import ConfigError, MapCorruptError, SequenceError
+from engram.frontend.frame import Frame
+from engram.frontend.ranked import RankedLandmarks
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import propagate_covariance
 from engram.odometry.outside import MotionSource
@@ -22,11 +24,13 @@ from engram.sequences.framelog.file import (
     FrameLogHeader,
     StepRow,
     decode_frame,
+    decode_more,
     decode_step,
     framelog_file,
     frames_table,
     log_digest,
     log_table,
+    more_table,
 )
 from engram.sequences.layouts import with_options
 from engram.sequences.motion_files import motion_of_files
@@ -67,10 +71,17 @@ class FrameLog:
     With a range of frames, odometry is composed over the frames left out; if one of those steps
     failed, the composed step fails too. With `skip_bad`, damaged frames are left out, too, and
     counted.
+
+    Args:
+        landmarks: of each frame, the first so many of those that the log keeps; None for the
+            front-end's own. Odometry stays that of its own.
     """
 
-    def __init__(self, path: str | Path, options: OpenOptions | None = None) -> None:
+    def __init__(
+        self, path: str | Path, options: OpenOptions | None = None, landmarks: int | None = None
+    ) -> None:
         self._path = Path(path)
+        self._landmarks = landmarks
         options = options or OpenOptions()
         self._file = framelog_file(self._path)
         self._file.check_regular()
@@ -164,6 +175,26 @@ class FrameLog:
         """Why each of the `skipped` frames was left out."""
         return list(self._skipped_reasons)
 
+    def ranked(self, index: int) -> RankedLandmarks | None:
+        """All landmarks that are kept of a chosen frame; None where there are no further ones."""
+        number = self._numbers[index]
+        try:
+            with self._file.errors(), self._engine.connect() as connection:
+                row, step = self._frame_row(connection, number)
+                frame = decode_frame(step, row.landmarks, row.thumbnail, self._header)
+                return self._ranked(connection, row.digest, frame, number)
+        except MapCorruptError as error:
+            raise self._named(error) from error
+
+    def _ranked(
+        self, connection: Connection, step_digest: bytes, frame: Frame, number: int
+    ) -> RankedLandmarks | None:
+        if "more" not in self._file.kind.metadata.tables:
+            return None
+        query = select(more_table).where(more_table.c.number == number)
+        row = connection.execute(query.order_by(more_table.c.number)).one_or_none()
+        return None if row is None else decode_more(row, step_digest, frame)
+
     def close(self) -> None:
         """Closes the file; the next access opens it again."""
         self._engine.dispose()
@@ -201,6 +232,10 @@ class FrameLog:
             with self._file.errors(), self._engine.connect() as connection:
                 row, step = self._frame_row(connection, number)
                 frame = decode_frame(step, row.landmarks, row.thumbnail, self._header)
+                if self._landmarks is not None:
+                    ranked = self._ranked(connection, row.digest, frame, number)
+                    if ranked is not None:
+                        frame = replace(frame, landmarks=ranked.first(self._landmarks))
                 odometry = self._motion(connection, previous, step)
         except MapCorruptError as error:
             raise self._named(error) from error
