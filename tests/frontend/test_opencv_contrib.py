@@ -11,11 +11,9 @@ import pytest
 from tests.cli.conftest import engram  # noqa: F401
 from tests.core.textures import texture
 
-from engram.errors import MissingExtraError
 from engram.frontend.features import FEATURES
 from engram_lab.bench.data import BenchData, synthetic_drive
 from engram_lab.bench.runner import run_bench
-from engram_lab.fits.world import reference_frame
 from engram_lab.teblid import TEBLID
 
 CURE = "pip install --force-reinstall --no-deps opencv-contrib-python-headless"
@@ -56,9 +54,3 @@ def test_the_bench_goes_on_without_its_reference() -> None:
     assert stage.reference is None
     assert stage.note.startswith("no reference: the plain pipeline needs cv2.xfeatures2d")
     assert CURE in stage.note
-
-
-def test_the_reference_matcher_names_the_cure() -> None:
-    pair = synthetic_drive(frames=1, step_m=0.8)[0]
-    with pytest.raises(MissingExtraError, match=CURE):
-        reference_frame(pair)

@@ -18,6 +18,8 @@ FALSE_RAD = float(np.deg2rad(5.0))
 NEAR_M, EVENT_M = 0.5, 20.0
 # A fix claims to be sure from this confidence on.
 SURE = 7.0
+# Lengths over which drift is measured. Source: KITTI's odometry benchmark.
+STRETCHES_M = (100.0, 200.0, 300.0)
 # Shares of errors that the ellipsoids of covariances should hold.
 LEVELS = (0.5, 0.9, 0.99)
 
@@ -129,3 +131,18 @@ def events(false_fixes: Iterable[SE3]) -> int:
         count += last is None or (last.inverse() @ here).distance_m > EVENT_M
         last = here
     return count
+
+
+def lap_drift(poses: Sequence[SE3], truth: Sequence[SE3]) -> float:
+    """Median error over `STRETCHES_M`, as a share of their length; NaN for a shorter lap."""
+    steps = [(a.inverse() @ b).distance_m for a, b in pairwise(truth)]
+    driven_m = np.concatenate([[0.0], np.cumsum(steps)])
+    errors = []
+    for first in range(0, len(truth), 10):
+        for length_m in STRETCHES_M:
+            last = int(np.searchsorted(driven_m, driven_m[first] + length_m))
+            if last < len(truth):
+                found = poses[first].inverse() @ poses[last]
+                wrong = found.inverse() @ (truth[first].inverse() @ truth[last])
+                errors.append(wrong.distance_m / length_m)
+    return float(np.median(errors)) if errors else float("nan")

@@ -1,9 +1,8 @@
-"""Fits of constants, on cases worked by hand; the town stays as hard as it was calibrated to be."""
+"""Fits of constants, on cases worked by hand."""
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections import Counter
 from pathlib import Path
@@ -11,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lab.tests.evaluation.campaigns import write_campaign
-from tests.opencv import needs_contrib
 
 from engram.errors import SequenceError
 from engram.fleet.download.coverage import BINS, INTERVALS, Weather
@@ -21,7 +19,7 @@ from engram.ranking.context import Foreseen
 from engram.ranking.policies import policy_named
 from engram.ranking.recall import RECALL
 from engram.testing.contracts import make_context
-from engram_lab.fits import recall, world
+from engram_lab.fits import recall
 from engram_lab.fits.confidence import Row, Rows, fitted, judged, judged_lookalikes, logistic
 from engram_lab.fits.forecasts import (
     class_of,
@@ -33,23 +31,9 @@ from engram_lab.fits.forecasts import (
     read,
     sun_deg,
 )
-from engram_lab.fits.world import (
-    LAPS,
-    Appearance,
-    appearance,
-    appearance_table,
-    falloff_table,
-    inliers_of,
-    load_clip,
-    measure_laps,
-    month,
-    reference_frames,
-    world_hash,
-)
+from engram_lab.fits.months import LAPS, measure_laps, month
 from engram_lab.studies.drives import campaign_logs
-from engram_lab.town import textures
 from engram_lab.town.campaigns import Size, campaign_named
-from engram_lab.town.rendering import VISITS, Places
 
 RNG = np.random.default_rng(3)
 
@@ -272,59 +256,6 @@ def test_the_sun_of_a_drive_is_told_by_its_name():
     assert sun_deg(Path("003-0715T2330-fair-wildcat.framelog")) == -6.0
 
 
-@pytest.fixture(scope="module")
-def seen() -> Appearance:
-    """Five places of a town that the knobs were set on, and the visits that tell most."""
-    visits = ("next morning", "an hour later", "night", "overcast")
-    return appearance(Places(1, every_m=30.0), visits=visits)
-
-
-@pytest.mark.long
-@needs_contrib
-def test_light_costs_inliers_as_it_was_calibrated_to(seen: Appearance) -> None:
-    means = {name: counts.mean() for name, counts in seen.inliers.items()}
-    # Five places scatter by a fifth around the table of all; a knob that is turned shows.
-    assert 450 < seen.corners.mean() < 750
-    assert means["next morning"] > 80
-    assert 0.45 < means["an hour later"] / means["next morning"] < 0.9
-    assert means["overcast"] < 0.35 * means["next morning"]
-    assert means["night"] < 5
-
-
-@pytest.mark.long
-@needs_contrib
-def test_a_visit_matches_itself_at_every_place() -> None:
-    places = Places(1, every_m=75.0)
-    frames = reference_frames(places, VISITS["morning"])
-    # About half of the corners get a disparity, and each is its own best match.
-    assert inliers_of(frames, frames).min() > 150
-
-
-def test_the_table_pools_places_and_not_towns() -> None:
-    names = [name for name in VISITS if name != "morning"]
-
-    def town(places: int, inliers: int) -> Appearance:
-        return Appearance(np.full(places, 600), {name: np.full(places, inliers) for name in names})
-
-    rows = appearance_table(Appearance.pooled([town(3, 100), town(1, 0)]))
-    by_what = {row.what: row.value for row in rows}
-    assert by_what["same hour, next day"] == 75.0
-    assert by_what["morning map, overcast"] == 75.0
-
-
-def test_inliers_ahead_are_compared_with_the_clip() -> None:
-    rows = falloff_table({1: 80.0, 6: 40.0}, {1: 100.0, 6: 20.0})
-    assert [row.value for row in rows] == [0.8, 2.0]
-    assert [row.what for row in rows] == ["1.2 m ahead", "7.2 m ahead"]
-
-
-def test_the_worlds_hash_follows_what_sets_its_difficulty(monkeypatch) -> None:
-    before = world_hash()
-    assert world_hash() == before
-    monkeypatch.setattr(world, "Style", lambda: textures.Style(relief=1.0))
-    assert world_hash() != before
-
-
 def test_the_month_is_begbroke_in_small() -> None:
     campaign = month()
     assert (len(campaign.sessions), campaign.length_m) == (LAPS, 150)
@@ -362,16 +293,6 @@ def test_laps_that_all_look_different_are_all_saved_and_fail_everywhere(tmp_path
     found = measure_laps([drive.path for drive in drives], tmp_path / "work")
     assert found.saved > 0.9
     assert found.fails > 0.9
-
-
-@pytest.mark.data
-def test_the_clip_is_kittis(data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ENGRAM_DATA", str(data_dir))
-    clip = load_clip()
-    assert clip is not None
-    assert len(clip) == 51
-    spacing_m = np.mean([(a[0].inverse() @ b[0]).distance_m for a, b in itertools.pairwise(clip)])
-    assert spacing_m == pytest.approx(1.197, abs=0.001)
 
 
 def test_a_lap_that_is_not_rendered_is_named(tmp_path: Path) -> None:

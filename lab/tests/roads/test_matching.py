@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import zipfile
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from engram.errors import ConfigError
 from engram.geometry.se3 import SE3
+from engram_lab.roads.distance import load_clip
 from engram_lab.roads.matching import Answer, Answers, Mapped, distinct, resected
 from engram_lab.roads.odometry import tracked
 from engram_lab.roads.xfeat import _convolved, mutual, read_weights
@@ -127,3 +129,18 @@ def test_a_table_of_other_columns_is_refused(tmp_path: Path):
     table.write_text("town,visit\n4,rain\n")
     with pytest.raises(ConfigError, match="has columns"):
         Answers(table, "seasons")
+
+
+@pytest.mark.data
+def test_the_clip_is_kittis(data_dir: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ENGRAM_DATA", str(data_dir))
+    clip = load_clip()
+    assert len(clip) == 51
+    spacing_m = np.mean([(a[0].inverse() @ b[0]).distance_m for a, b in pairwise(clip)])
+    assert spacing_m == pytest.approx(1.197, abs=0.001)
+
+
+def test_a_clip_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("ENGRAM_DATA", str(tmp_path))
+    with pytest.raises(ConfigError, match="must name a folder with"):
+        load_clip()

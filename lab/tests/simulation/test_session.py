@@ -17,7 +17,7 @@ from lab.tests.simulation.conftest import small
 
 from engram.errors import ConfigError
 from engram_lab.town.camera_model import Lens
-from engram_lab.town.campaigns import Campaign, Size, campaign_named
+from engram_lab.town.campaigns import Campaign, campaign_named
 from engram_lab.town.mesh import Kind
 from engram_lab.town.session import SimulatedDrive
 
@@ -61,8 +61,9 @@ def test_a_covered_lens_shows_nothing_and_what_was_seen_comes_back(hamlet: Campa
     covered = Lens(covered_from_m=drive.poses[3].driven_m, covered_to_m=drive.poses[5].driven_m)
     drive.plan = replace(drive.plan, lens=covered)
     contrast = [float(cv2.GaussianBlur(pair.left, (0, 0), 2).std()) for pair in islice(drive, 8)]
-    assert max(contrast[3:5]) < 0.15 * min(contrast[:3])
-    assert min(contrast[5:]) > 0.15 * min(contrast[:3])
+    # Exposure rises after what little comes through, and shows its noise.
+    assert max(contrast[3:5]) < 0.25 * min(contrast[:3])
+    assert min(contrast[5:]) > 0.25 * min(contrast[:3])
 
 
 @pytest.mark.long
@@ -167,22 +168,10 @@ def test_unknown_names_and_numbers_are_refused(hamlet: Campaign) -> None:
 @pytest.mark.parametrize("name", ["keble", "oxford"])
 @given(seed=st.integers(0, 2**31 - 1))
 @settings(max_examples=30)
-def test_campaigns_of_few_drives_meet_sun_and_rain(name: str, seed: int) -> None:
-    """Each weather as often as its share of the summer says, to within one drive of ten."""
+def test_campaigns_of_few_drives_meet_sun_and_clouds(name: str, seed: int) -> None:
+    """Each sky as often as its share of the summer, to within one drive of ten, but in rain."""
     drawn = Counter(session.weather for session in campaign_named(name, seed).sessions)
-    assert drawn["clear"] in (2, 3)
-    assert drawn["overcast"] in (1, 2)
-    assert 1 <= drawn["rain"] + drawn["showers"] + drawn["damp"] <= 3
-    assert drawn["rain"] + drawn["showers"] >= 1
-
-
-@given(seed=st.integers(0, 2**31 - 1), size=st.sampled_from(Size))
-@settings(max_examples=20)
-def test_begbroke24h_is_as_wet_by_night_as_by_day(seed: int, size: Size) -> None:
-    whole = campaign_named("begbroke24h", seed, size).sessions
-    by_day = [one for one in whole if 6 <= one.start.hour < 18]
-    shares = [
-        np.mean([one.weather in ("rain", "showers") for one in part])
-        for part in (by_day, [one for one in whole if one not in by_day])
-    ]
-    assert np.allclose(shares, 0.22, atol=0.05)
+    rained = drawn["rain"] + drawn["damp"]
+    assert 2 - rained <= drawn["clear"] <= 3
+    assert 3 - rained <= drawn["overcast"] <= 4
+    assert set(drawn) <= {"clear", "fair", "broken", "overcast", "rain", "damp"}

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from engram.errors import ConfigError, IncompatibleError, SequenceError, WorkerError
-from engram.frontend.frontend import FrontendConfig
+from engram.frontend.frame import Landmarks
+from engram.frontend.frontend import Frontend, FrontendConfig
 from engram.monitor import Monitor
 from engram.robot.settings import Settings
 from engram.sequences.framelog.reader import FrameLog
 from engram.sequences.opening import open_drive
 from engram.sequences.sequence import first_pair_hash, session_of
 from engram_lab.town.campaigns import Campaign, campaign_named
-from engram_lab.town.conditions import World
 from engram_lab.town.session import SimulatedSequence
 from engram_lab.town.simulating import campaign_folder, met_path, simulate
 from engram_lab.truth import read_kitti_poses, read_truth, truth_path
@@ -55,9 +55,9 @@ def test_frame_logs_hold_every_frame_with_its_truth(short: Campaign, tmp_path: P
         log.close()
 
 
-def test_what_a_drive_of_world_6_met_stands_beside_its_truth(tmp_path: Path) -> None:
+def test_what_a_drive_met_stands_beside_its_truth(tmp_path: Path) -> None:
     """Frame by frame; the head of the truth says what calibration left of the rig's errors."""
-    rain = replace(campaign_named("hamlet", 2, world=World.SIX), spacing_m=30.0)
+    rain = replace(campaign_named("hamlet", 2), spacing_m=30.0)
     report = simulate(rain, tmp_path, sessions=[4])
     target = Path(report.files[0])
     assert target.parent.name == "hamlet-standard-seed2-v6"
@@ -70,6 +70,27 @@ def test_what_a_drive_of_world_6_met_stands_beside_its_truth(tmp_path: Path) -> 
     assert np.all(exposure > 0.2)
     residual = SimulatedSequence(rain, 4).drive.residual
     assert residual.text() in truth_path(target).read_text()
+
+
+def test_a_log_gives_other_numbers_of_landmarks_without_rendering(tmp_path: Path) -> None:
+    """Equal to the bit to a front-end that is asked for so many, and the report says how large."""
+    few = replace(campaign_named("hamlet", 2), spacing_m=60.0)
+    report = simulate(few, tmp_path, sessions=[0])
+    target = Path(report.files[0])
+    assert report.megabytes == pytest.approx(1e-6 * target.stat().st_size)
+    for number in (100, 600):
+        settings = FrontendConfig(landmarks=number)
+        for logged, pair in zip(
+            FrameLog(target, landmarks=number), SimulatedSequence(few, 0), strict=True
+        ):
+            wanted = Frontend(settings).extract(pair).landmarks
+            for name in Landmarks.__slots__:
+                np.testing.assert_array_equal(
+                    getattr(logged.frame.landmarks, name), getattr(wanted, name)
+                )
+    ranked = FrameLog(target).ranked(1)
+    assert ranked is not None
+    assert len(ranked.ranks) > 800
 
 
 def test_what_is_there_is_not_rendered_again(short: Campaign, tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ from engram.frontend.frontend import Frontend, FrontendConfig
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram.sequences.framelog.reader import FrameLog
+from engram_lab.accuracy import lap_drift
 from engram_lab.eyes import JUDGED, Scene, judged_scene
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.town.campaigns import Campaign, campaign_named
@@ -44,7 +45,6 @@ from engram_lab.town.session import SimulatedDrive
 from engram_lab.town.simulating import campaign_folder, campaigns_folder
 from engram_lab.truth import read_truth
 
-STRETCHES_M = (100.0, 200.0, 300.0)
 _RAINY = ("rain", "rain again", "rain at night", "fog", "morning")
 
 
@@ -77,21 +77,6 @@ def drift(campaign: Campaign, campaigns: Path) -> None:
         print(
             f"median {light}: {100 * float(np.median(laps)):.2f} % of {len(laps)} laps (≤ {asked})"
         )
-
-
-def lap_drift(poses: Sequence[SE3], truth: Sequence[SE3]) -> float:
-    """Median error over `STRETCHES_M`, as a share of their length; NaN for a shorter lap."""
-    steps = [(a.inverse() @ b).distance_m for a, b in itertools.pairwise(truth)]
-    driven_m = np.concatenate([[0.0], np.cumsum(steps)])
-    errors = []
-    for first in range(0, len(truth), 10):
-        for length_m in STRETCHES_M:
-            last = int(np.searchsorted(driven_m, driven_m[first] + length_m))
-            if last < len(truth):
-                found = poses[first].inverse() @ poses[last]
-                wrong = found.inverse() @ (truth[first].inverse() @ truth[last])
-                errors.append(wrong.distance_m / length_m)
-    return float(np.median(errors)) if errors else float("nan")
 
 
 def disparity(campaign: Campaign, laps: Sequence[int], every: int) -> None:

@@ -20,7 +20,6 @@ import numpy as np
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.roads.matching import SIFT, Answer, Answers, Mapped, learnt
 from engram_lab.roads.seasons import JUDGED
-from engram_lab.town.conditions import World
 from engram_lab.town.rendering import Places, Visit, at
 
 _LOOP_M, _EVERY_M = 300.0, 15.0
@@ -67,7 +66,7 @@ def _of_morning(towns: list[int], loop_m: float, answers: Answers) -> Iterator[F
 
 
 def _places(town: int, loop_m: float) -> Places:
-    return Places(town, every_m=_EVERY_M, world=World.SIX, loop_m=loop_m)
+    return Places(town, every_m=_EVERY_M, loop_m=loop_m)
 
 
 def _seen(maps: dict[int, Mapped], visit: Visit, answers: Answers) -> list[Answer]:

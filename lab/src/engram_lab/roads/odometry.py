@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 
 from engram.frontend.frame import StereoPair
 from engram.geometry.se3 import SE3
-from engram_lab.checks.town_accuracy import lap_drift
+from engram_lab.accuracy import lap_drift
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.roads.matching import resected
 from engram_lab.roads.seasons import JUDGED
 from engram_lab.town.campaigns import campaign_named
-from engram_lab.town.conditions import World
 from engram_lab.town.session import SimulatedDrive
 
 _LOOP_M = 300.0
@@ -101,7 +100,7 @@ def figures(towns: list[int], loop_m: float) -> Iterator[Figure]:
     for name, start, weather in _CONDITIONS:
         courses = []
         for town in towns:
-            hamlet = campaign_named("hamlet", town, world=World.SIX)
+            hamlet = campaign_named("hamlet", town)
             plan = replace(hamlet.sessions[0], start=start, weather=weather)
             campaign = replace(hamlet, length_m=loop_m, sessions=(plan,))
             courses.append(course(SimulatedDrive(campaign, 0)))

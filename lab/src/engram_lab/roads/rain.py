@@ -16,7 +16,6 @@ import numpy as np
 
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.town.campaigns import campaign_named
-from engram_lab.town.conditions import World
 from engram_lab.town.drive import robot_named
 from engram_lab.town.glass import OPEN_GLASS, Pane, WetLens
 from engram_lab.town.rainfall import STEP, Rainfall
@@ -57,7 +56,7 @@ def panes() -> Iterator[Figure]:
 
 def rendering() -> Iterator[Figure]:
     """Processor time of a pair on one core, in rain and dry, its tiles built."""
-    hamlet = campaign_named("hamlet", world=World.SIX)
+    hamlet = campaign_named("hamlet")
     for weather in ("overcast", "rain"):
         plan = replace(hamlet.sessions[0], weather=weather)
         drive = SimulatedDrive(replace(hamlet, sessions=(plan,)), 0)

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.roads.matching import SIFT, Answer, Answers, Mapped
-from engram_lab.town.conditions import World
 from engram_lab.town.rendering import Places, Visit, at
 
 JUDGED = (501, 502, 503)
@@ -46,6 +45,7 @@ class Against:
     road: float
 
 
+# Winter is that after the next summer: on the road, too, a year of works lay between.
 CONDITIONS = tuple(
     Against(Visit(name, start, weather, day), road)
     for name, start, weather, day, road in (
@@ -54,7 +54,7 @@ CONDITIONS = tuple(
         ("sun at 9 h", at(7, 16, 8.0), "clear", 16, -12),
         ("sun at 16 h", at(7, 16, 15.0), "clear", 16, -12),
         ("dusk", at(7, 20, 20.55), "fair", 20, -6),
-        ("winter", datetime(2025, 12, 10, 11, tzinfo=UTC), "overcast", 500, -7),
+        ("winter", datetime(2026, 12, 10, 11, tzinfo=UTC), "overcast", 500, -7),
         ("night", at(7, 21, 23.0), "fair", 21, -78),
         ("night in rain", at(7, 23, 23.0), "rain", 23, -79),
     )
@@ -71,10 +71,7 @@ def shares(near: NDArray[np.bool_], base: NDArray[np.bool_]) -> tuple[float, flo
 
 def figures(towns: list[int], loop_m: float, only: list[str], answers: Answers) -> Iterator[Figure]:
     """Shares of each condition, differences to overcast, and how far those are from the road's."""
-    maps = {
-        town: Mapped(SIFT, Places(town, every_m=EVERY_M, world=World.SIX, loop_m=loop_m), MAP)
-        for town in towns
-    }
+    maps = {town: Mapped(SIFT, Places(town, every_m=EVERY_M, loop_m=loop_m), MAP) for town in towns}
 
     def seen(visit: Visit) -> list[Answer]:
         return [one for town, mapped in maps.items() for one in answers.of(town, mapped, visit)]

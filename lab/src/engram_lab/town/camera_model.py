@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from engram.geometry.cameras import StereoCamera
 from engram_lab import _town
-from engram_lab.town.conditions import Moment, World
+from engram_lab.town.conditions import Moment
 from engram_lab.town.drive import Pose, Robot
 from engram_lab.town.glass import OPEN_GLASS, Glass, Pane, WetLens, film, streaks
 
@@ -19,22 +19,11 @@ Luminance = NDArray[np.float32]
 Grey = NDArray[np.uint8]
 
 _TARGET = 0.4  # exposed luminance that the metered highlights are brought to
-_MOST_GAIN, _MOST_GAIN_6 = 26.0, 300.0
+_MOST_GAIN = 300.0
 _SHUTTER_BY_DAY_S = 0.0007
 _LONGEST_SHUTTER_S = 0.012
 _GLARE = 0.1  # of the sun's power, right beside it
 _CLOTH = 0.002  # share of the light that comes through what covers a lens
-# Drops that sit on the glass in the hardest rain, on 512×384 pixels: three quarters of the picture
-# lie behind one. Odometry mostly bears that; of the nodes about, few match (calibration, row f).
-_DROPS = 220
-# What the hash of the world is made from, besides the robots.
-CONSTANTS = {
-    "target": _TARGET,
-    "most_gain": _MOST_GAIN,
-    "shutter_by_day_s": _SHUTTER_BY_DAY_S,
-    "longest_shutter_s": _LONGEST_SHUTTER_S,
-    "drops": _DROPS,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,15 +71,13 @@ class Met:
 class CameraModel:
     """Turns luminance into grey levels; keeps the exposure from frame to frame."""
 
-    def __init__(self, robot: Robot, seed: int, lens: Lens, world: World = World.FIVE) -> None:
+    def __init__(self, robot: Robot, seed: int, lens: Lens) -> None:
         self._robot = robot
         self._seed = seed
         self._lens = lens
         self._gain: float | None = None
         self._pace = 0.0  # change of its logarithm from frame to frame
-        self._sitting = [((-1, -1), np.zeros((0, 0), dtype=np.float32))] * 2
         self._dirt = [self._specks(eye) for eye in range(2)] if lens.dirt > 0 else []
-        self._world = world
         panes = [
             Pane(lens.glass, robot.camera, [seed & 0x7FFFFFFF, 0x61A5, eye]) for eye in range(2)
         ]
@@ -125,19 +112,13 @@ class CameraModel:
         for eye in range(2):
             light = self._blur(luminance[eye], inverse_depths[eye], pose.twist * shutter_s)
             light = _veil(light, gain)
-            if self._world is World.SIX:
-                light = _glare(light, moment, pose, robot.camera)
+            light = _glare(light, moment, pose, robot.camera)
             if self._dirt:
                 light = _smudge(light, self._dirt[eye])
-            if moment.rain > 0.05:
-                light = self._wet(light, moment.rain, frame, eye)
-            if self._world is World.SIX:
-                light = self._rained_on(light, moment, pose, shutter_s, eye)
+            light = self._rained_on(light, moment, pose, shutter_s, eye)
             noise_seed = (self._seed * 1_000_003 + 2 * frame + eye) & 0xFFFFFFFFFFFF
             # A longer shutter brings light, only what it cannot bring is amplified with its noise.
-            amplified = gain
-            if self._world is World.SIX:
-                amplified *= _SHUTTER_BY_DAY_S / shutter_s
+            amplified = gain * _SHUTTER_BY_DAY_S / shutter_s
             pair.append(
                 _town.develop(
                     np.ascontiguousarray(light, dtype=np.float32), gain,
@@ -148,19 +129,16 @@ class CameraModel:
         return pair[0], pair[1]
 
     def _meter(self, luminance: Luminance) -> float:
-        """The gain, which follows the scene with a lag of about three frames."""
+        """The gain, which hunts: it follows the scene with a lag of some frames, and overshoots."""
         rows = luminance.shape[1]
         metered = luminance[0, rows // 6 :: 4, ::4]
         bright = float(np.quantile(metered, 0.85))
-        most = _MOST_GAIN_6 if self._world is World.SIX else _MOST_GAIN
-        wanted = min(_TARGET / max(bright, 1e-6), most)
+        wanted = min(_TARGET / max(bright, 1e-6), _MOST_GAIN)
         if self._gain is None:
             self._gain = wanted
-        elif self._world is World.SIX:  # hunts: it overshoots what it follows
-            self._pace = 0.6 * self._pace + 0.25 * float(np.log(wanted / self._gain))
-            self._gain = min(self._gain * float(np.exp(self._pace)), most)
         else:
-            self._gain *= (wanted / self._gain) ** 0.3
+            self._pace = 0.6 * self._pace + 0.25 * float(np.log(wanted / self._gain))
+            self._gain = min(self._gain * float(np.exp(self._pace)), _MOST_GAIN)
         return self._gain
 
     def _blur(
@@ -199,34 +177,6 @@ class CameraModel:
             light = streaks(light, self._robot.camera, moment.rain_mm_h, shutter_s, air)
             light = film(light, moment.rain_mm_h, pose.elapsed_s, seed)
         return self._eyes[eye].through(light)
-
-    def _wet(self, light: Luminance, rain: float, frame: int, eye: int) -> Luminance:
-        height, width = light.shape
-        rng = np.random.default_rng([self._seed & 0x7FFFFFFF, 0x3A14, frame, eye])
-        air = float(np.quantile(light[::8, ::8], 0.8))
-        streaks = np.zeros((height, width), dtype=np.float32)
-        low, high = np.array([[0, -20, 8, 0.05], [width, height, 28, 0.22]])
-        for x, y, long, bright in low + (high - low) * rng.random((int(150 * rain), 4)):
-            end = (int(x + 0.08 * long), int(y + long))
-            cv2.line(streaks, (int(x), int(y)), end, float(air * bright), 1)
-        light = light + cv2.GaussianBlur(streaks, (0, 0), 0.6)
-        soft = self._drops(int(_DROPS * rain**1.6 * height * width / (384 * 512)), frame, eye)
-        through = cv2.blur(np.minimum(light, 2 * air), (27, 27))
-        return np.asarray(light * (1 - soft) + through * soft, dtype=np.float32)
-
-    def _drops(self, count: int, frame: int, eye: int) -> Luminance:
-        """How much of each pixel drops take, 0…1; they sit for nine frames before they run off."""
-        key = (count, frame // 9)
-        if self._sitting[eye][0] != key:
-            camera = self._robot.camera
-            rng = np.random.default_rng([self._seed & 0x7FFFFFFF, 0xD209, eye, frame // 9])
-            drops = np.zeros((camera.height, camera.width), dtype=np.float32)
-            low, high = np.array([[0, 0, 8], [camera.width, camera.height, 30]])
-            for x, y, radius in low + (high - low) * rng.random((count, 3)):
-                cv2.circle(drops, (int(x), int(y)), int(radius), 1.0, -1)
-            soft = np.asarray(cv2.GaussianBlur(drops, (0, 0), 3.0), dtype=np.float32)
-            self._sitting[eye] = (key, soft)
-        return self._sitting[eye][1]
 
 
 def _covered(luminance: Luminance) -> Luminance:

@@ -12,7 +12,7 @@ import numpy as np
 
 from engram.errors import ConfigError
 from engram_lab.town.camera_model import CLEAN, Lens
-from engram_lab.town.conditions import OXFORD, Place, World
+from engram_lab.town.conditions import OXFORD, Place
 from engram_lab.town.glass import Glass
 from engram_lab.town.rainfall import STEP, Rainfall, rates_exceeded
 from engram_lab.town.streets import (
@@ -25,7 +25,7 @@ from engram_lab.town.streets import (
 )
 
 # Raised whenever a frame of any campaign changes: rendered data is kept by it.
-WORLD_VERSION = 5
+WORLD_VERSION = 6
 
 
 _SUMMER_TIME = timedelta(hours=1)
@@ -63,7 +63,7 @@ class SessionPlan:
         seed: of the driving line, the noise, the traffic and the clouds.
         lens: what is wrong with the front lens.
         beside: driven along the route beside the campaign's.
-        rain_mm_h: mean rate on the drive; None for the weather's own. World 6 only.
+        rain_mm_h: mean rate on the drive; None for the weather's own.
     """
 
     number: int
@@ -102,7 +102,6 @@ class Campaign:
         place: where on earth.
         fronts: how the fronts repeat; None where each is unique.
         first_day: from which structural change counts.
-        world: how light, weather and life are made.
     """
 
     name: str
@@ -117,7 +116,6 @@ class Campaign:
     spacing_m: float = 0.7
     place: Place = OXFORD
     fronts: Fronts | None = None
-    world: World = World.FIVE
 
     @property
     def first_day(self) -> int:
@@ -145,9 +143,7 @@ class Campaign:
         return self.sessions[number]
 
 
-def campaign_named(
-    name: str, seed: int = 1, size: Size = Size.STANDARD, world: World = World.FIVE
-) -> Campaign:
+def campaign_named(name: str, seed: int = 1, size: Size = Size.STANDARD) -> Campaign:
     """A campaign by name.
 
     Raises:
@@ -157,32 +153,24 @@ def campaign_named(
         raise ConfigError(f"unknown campaign '{name}'; known are: {', '.join(CAMPAIGNS)}")
     if not 0 <= seed < 2**31:
         raise ConfigError(f"seed is {seed}, must be 0 to {2**31 - 1}")
-    campaign = CAMPAIGNS[name](seed, size)
-    return campaign if world is campaign.world else _in_world_6(campaign)
+    return CAMPAIGNS[name](seed, size)
 
 
-# Skies in place of those whose rain a course of rain decides about.
-_DRY = {"rain": "overcast", "showers": "broken", "damp": "overcast"}
 _DAMP_FOR = timedelta(minutes=60)  # after rain
 
 
-def _in_world_6(campaign: Campaign) -> Campaign:
-    """The same drives in world 6: where weathers are dealt, it rains as a course of rain has it."""
-    if campaign.home not in _DEALT:
-        return replace(campaign, world=World.SIX)
-    whole = CAMPAIGNS[campaign.home](campaign.seed, campaign.size).sessions
-    starts = tuple(plan.start for plan in whole)
-    august = campaign.home == "begbroke24h"
-    rain = _dry_august(campaign.seed, starts) if august else Rainfall(campaign.seed)
-    first = starts[0] - _DAMP_FOR
-    now = rain.at(first, [plan.start for plan in campaign.sessions])
-    before = rain.at(first, [plan.start - _DAMP_FOR / 2 for plan in campaign.sessions])
+def _under(rain: Rainfall, plans: tuple[SessionPlan, ...]) -> tuple[SessionPlan, ...]:
+    """The same drives, where it rains when and as hard as a course of rain has it."""
+    first = plans[0].start - _DAMP_FOR
+    now = rain.at(first, [plan.start for plan in plans])
+    before = rain.at(first, [plan.start - _DAMP_FOR / 2 for plan in plans])
     sessions = []
-    for plan, rate, earlier in zip(campaign.sessions, now, before, strict=True):
-        sky = "damp" if earlier > 0 else _DRY.get(plan.weather, plan.weather)
-        wet = replace(plan, weather="rain", rain_mm_h=rate)
-        sessions.append(wet if rate > 0 else replace(plan, weather=sky))
-    return replace(campaign, world=World.SIX, sessions=tuple(sessions))
+    for plan, rate, earlier in zip(plans, now, before, strict=True):
+        if rate > 0:
+            sessions.append(replace(plan, weather="rain", rain_mm_h=rate))
+        else:
+            sessions.append(replace(plan, weather="damp") if earlier > 0 else plan)
+    return tuple(sessions)
 
 
 @lru_cache(maxsize=64)
@@ -199,8 +187,6 @@ def _dry_august(seed: int, starts: tuple[datetime, ...]) -> Rainfall:
     raise ConfigError(f"seed {seed}: no course of rain of {_AUGUST_MM:g} mm found; take another")
 
 
-# Campaigns whose weathers are dealt.
-_DEALT = ("begbroke", "begbroke24h", "keble", "oxford")
 _AUGUST_MM, _AUGUST_WET = 19.0, 0.0195
 
 
@@ -219,21 +205,19 @@ def _planned(
     )  # fmt: skip
 
 
-# How often each weather comes, as in a very wet English summer: drops on the lens are what our own
-# matcher fails at, and held-out laps shall fail as calibration (f) asks.
-_SUMMER = (("clear", 0.21), ("fair", 0.17), ("broken", 0.17), ("overcast", 0.17), ("showers", 0.12),
-           ("rain", 0.10), ("damp", 0.06))  # fmt: skip
+# How often each sky comes in a summer; rain comes by its own course.
+_SUMMER = {"clear": 0.21, "fair": 0.17, "broken": 0.29, "overcast": 0.33}
 
 
 def _dealt(rng: np.random.Generator, count: int) -> list[str]:
-    """Weathers of some drives in the shares of the summer, to within one drive, in random order.
+    """Skies of some drives in the shares of the summer, to within one drive, in random order.
 
-    Ten that are drawn one by one can miss both sun and rain, and nothing would ever fail there.
+    Ten that are drawn one by one can miss the sun, and nothing would ever fail there.
     """
-    names, shares = zip(*_SUMMER, strict=True)
+    names, shares = list(_SUMMER), list(_SUMMER.values())
     at = (rng.random() + np.arange(count)) / count
     dealt = np.searchsorted(np.cumsum(shares)[:-1], at, side="right")
-    return [str(names[k]) for k in rng.permutation(dealt)]
+    return [names[k] for k in rng.permutation(dealt)]
 
 
 def by_day(start: datetime) -> bool:
@@ -300,11 +284,12 @@ def _begbroke(seed: int, size: Size) -> Campaign:
     sessions = _planned(
         "begbroke", seed, starts, _dealt(rng, 107), ["wildcat"] * 107, [False] * 107
     )
+    sessions = _under(Rainfall(seed), sessions)
     return Campaign("begbroke", seed, 700, False, sessions, 0.25, size, "begbroke")
 
 
 def _begbroke24h(seed: int, size: Size) -> Campaign:
-    """Regular starts day and night, 6 August to 5 September; as much rain at night as by day."""
+    """Regular starts day and night, 6 August to 5 September; it rains as in August 2013."""
     count = 140 if size is Size.FULL else 80
     rng = np.random.default_rng([seed, 0x24])
     first = datetime(2025, 8, 6, tzinfo=UTC)
@@ -314,6 +299,7 @@ def _begbroke24h(seed: int, size: Size) -> Campaign:
     of_day, of_night = iter(_dealt(rng, sum(day))), iter(_dealt(rng, count - sum(day)))
     weathers = [next(of_day if light else of_night) for light in day]
     sessions = _planned("begbroke24h", seed, starts, weathers, ["wildcat"] * count, [False] * count)
+    sessions = _under(_dry_august(seed, tuple(starts)), sessions)
     return Campaign("begbroke24h", seed, 700, False, sessions, 0.25, size, "begbroke24h")
 
 
@@ -325,6 +311,7 @@ def _keble(seed: int, size: Size) -> Campaign:
     sessions = _planned(
         "keble", seed, starts, _dealt(rng, count), ["bicycle"] * count, [False] * count
     )
+    sessions = _under(Rainfall(seed), sessions)
     return Campaign("keble", seed, 2200, True, sessions, 1.0, size, "keble")
 
 
@@ -335,12 +322,13 @@ def _oxford(seed: int, size: Size) -> Campaign:
     sessions = _planned(
         "oxford", seed, starts, _dealt(rng, 10), ["wildcat"] * 10, [k % 2 == 1 for k in range(10)]
     )
+    sessions = _under(Rainfall(seed), sessions)
     length = 7600 if size is Size.FULL else 3000
     return Campaign("oxford", seed, length, False, sessions, 0.9, size, "oxford", 0.65)
 
 
 def _wet(seed: int, size: Size) -> Campaign:
-    """A stress of world 6, never averaged with months: three of four drives in rain of 1 mm/h on.
+    """A stress, never averaged with months: three of four drives in rain of 1 mm/h on.
 
     Rates are spread over those of Oxford's rain beyond 1 mm/h; every sixth drive is at night.
     """
@@ -356,7 +344,7 @@ def _wet(seed: int, size: Size) -> Campaign:
     weathers = ["rain" if k in rates else "overcast" for k in range(count)]
     plans = _planned("wet", seed, starts, weathers, ["wildcat"] * count, [False] * count)
     sessions = tuple(replace(plan, rain_mm_h=rates.get(plan.number)) for plan in plans)
-    return Campaign("wet", seed, 700, False, sessions, 0.25, size, "wet", world=World.SIX)
+    return Campaign("wet", seed, 700, False, sessions, 0.25, size, "wet")
 
 
 def _covered(seed: int, size: Size) -> Campaign:

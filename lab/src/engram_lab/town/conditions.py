@@ -5,12 +5,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import ConfigError
+
+# Lamps (15 lx below), headlights (20 lx ten metres ahead) and windows (60 cd/m²) as they are beside
+# the sky at dusk: 50 lx from a sun 3° down.
+LAMP_POWER = 0.35  # of a street lamp, luminance × m² of a white surface
+WINDOW = 0.02  # luminance of a lit window
+BEAM = 0.3  # power of the robot's headlights
+AUREOLE = 0.1  # share of the sun's light that comes from around it and fills shadows
+MIRRORS = 0.5  # of what wet tarmac throws back; the rest is scattered by its grain
+# At night, with what lit walls and windows throw on each other, which is not traced; and by how
+# much more clouds throw back (3 to 10 times overcast: Kyba et al. 2011).
+_TOWN_GLOW, _GLOW_OF_CLOUDS = 0.0005, 2.0
 
 _J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
 
@@ -60,19 +70,12 @@ def clear_sun_power(elevation_sine: float) -> float:
     return 5.2 * math.exp(-0.21 / max(elevation_sine, 0.035))
 
 
-def clear_sky_power(elevation_sine: float, by_night: float = 0.0035) -> float:
+def clear_sky_power(elevation_sine: float) -> float:
     """Mean luminance of a clear sky; falls by about a factor ten for every 3° below −2°."""
     elevation_deg = math.degrees(math.asin(max(-1.0, min(1.0, elevation_sine))))
     if elevation_deg >= 0:
         return 0.14 + 0.53 * math.sqrt(elevation_sine)
-    return max(by_night, 0.14 * 10 ** (elevation_deg / 3.6))
-
-
-class World(IntEnum):
-    """How light, weather and life are made; pictures of two worlds do not compare."""
-
-    FIVE = 5
-    SIX = 6
+    return 0.14 * 10 ** (elevation_deg / 3.6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +86,7 @@ class Weather:
         cloud: share of the sky that is covered, on average over the drive, 0…1.
         changes: how far that share swings along the way, 0…1.
         fog_per_m: extinction of the air.
-        rain: how hard it rains, mm/h; in world 5 0…1. `changes` makes it come and go.
+        rain_mm_h: that falls; `changes` makes it come and go.
         wet: film of water on the ground, 0…1.
         snow: how much lies, 0…1.
     """
@@ -91,7 +94,7 @@ class Weather:
     cloud: float = 0.0
     changes: float = 0.0
     fog_per_m: float = 0.0
-    rain: float = 0.0
+    rain_mm_h: float = 0.0
     wet: float = 0.0
     snow: float = 0.0
 
@@ -102,17 +105,12 @@ WEATHERS: dict[str, Weather] = {
     "broken": Weather(cloud=0.55, changes=0.45),
     "overcast": Weather(cloud=1.0, fog_per_m=0.0008),
     "fog": Weather(cloud=1.0, fog_per_m=0.035),
-    "rain": Weather(cloud=1.0, fog_per_m=0.006, rain=0.88, wet=1.0),
-    "showers": Weather(cloud=0.75, changes=0.5, fog_per_m=0.002, rain=0.58, wet=0.7),
+    # Rain clears the air but for its own drops; snow lies, the fall is over.
+    "rain": Weather(cloud=1.0, changes=0.2, fog_per_m=0.0015, rain_mm_h=4.0, wet=1.0),
+    "showers": Weather(cloud=0.75, changes=0.5, fog_per_m=0.001, rain_mm_h=2.0, wet=0.7),
     "damp": Weather(cloud=0.9, changes=0.2, fog_per_m=0.001, wet=0.7),
-    "snow": Weather(cloud=1.0, fog_per_m=0.010, snow=0.95),
+    "snow": Weather(cloud=1.0, fog_per_m=0.001, snow=0.5),
     "thaw": Weather(cloud=0.6, changes=0.3, wet=0.6, snow=0.45),
-}
-# World 6: snow as it lies after the fall; rain clears the air but for its own drops.
-WEATHERS_6: dict[str, Weather] = WEATHERS | {
-    "rain": Weather(cloud=1.0, changes=0.2, fog_per_m=0.0015, rain=4.0, wet=1.0),
-    "showers": Weather(cloud=0.75, changes=0.5, fog_per_m=0.001, rain=2.0, wet=0.7),
-    "snow": Weather(cloud=1.0, fog_per_m=0.001, snow=0.75),
 }
 
 
@@ -138,16 +136,11 @@ class Moment:
         cloud: share of the sky covered.
         cloud_shift: (2,) drift of the clouds, in the noise's texels.
         fog_per_m, haze: extinction; luminance of the air as a factor of the sky's.
-        wet, snow, rain: 0…1; rain is 0 in world 6.
+        wet, snow: 0…1.
+        rain_mm_h: that falls.
         lamps_on: street lamps and lit windows.
         headlights_on: of the robot and of others.
-        rain_mm_h: 0 in world 5.
         sun_deg: height of the sun.
-        aureole: share of the sun's light that comes from around it and fills shadows.
-        lamp_power: of a street lamp, luminance × m² of a white surface.
-        window: luminance of a lit window.
-        mirrors: how much of what stands there wet ground shows, 0…1.
-        beam: power of the robot's headlights; 1 lights as much as world 5's.
     """
 
     sun_direction: NDArray[np.float64]
@@ -159,24 +152,10 @@ class Moment:
     haze: float
     wet: float
     snow: float
-    rain: float
+    rain_mm_h: float
     lamps_on: bool
     headlights_on: bool
-    rain_mm_h: float = 0.0
-    sun_deg: float = 0.0
-    aureole: float = 0.5
-    lamp_power: float = 7.0
-    window: float = 0.3
-    mirrors: float = 0.0
-    beam: float = 1.0
-
-
-# World 6. Lamps (15 lx below), headlights (30 lx ten metres ahead) and windows (60 cd/m²) as they
-# are beside the sky at dusk: 50 lx from a sun 3° down. First values: reports/town.md.
-_AUREOLE_6 = 0.5
-_LAMP_POWER_6, _WINDOW_6, _BEAM_6 = 0.35, 0.02, 0.4
-_NIGHT_SKY_6 = 0.0003
-_MIRRORS_6 = 0.5  # the rest of what wet tarmac throws back is scattered by its grain
+    sun_deg: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,15 +167,13 @@ class Conditions:
         weather: key in `WEATHERS`.
         seed: of how the clouds pass.
         place: where.
-        world: how weather is made.
-        rain_mm_h: mean rate, in place of the weather's; world 6 only.
+        rain_mm_h: mean rate, in place of the weather's.
     """
 
     start: datetime
     weather: str
     seed: int
     place: Place = OXFORD
-    world: World = World.FIVE
     rain_mm_h: float | None = None
 
     def __post_init__(self) -> None:
@@ -214,22 +191,13 @@ class Conditions:
     def season(self) -> int:
         """0 with leaves, 1 autumn, 2 bare."""
         day = self.start.timetuple().tm_yday
-        if self.world is World.SIX and self.leaves == 0:
+        if self.leaves == 0:
             return 2
-        if self.world is World.SIX:
-            return 0 if day < 275 else 1
-        if 115 <= day < 285:
-            return 0
-        return 1 if 285 <= day < 325 else 2
+        return 0 if day < 275 else 1
 
     @property
     def leaves(self) -> float:
-        """Share of the leaves that are out: they come from mid-April, and fall till mid-November.
-
-        World 5 knows three seasons instead.
-        """
-        if self.world is World.FIVE:
-            return 1.0
+        """Share of the leaves that are out: from mid-April on, and falling till mid-November."""
         day = self.start.timetuple().tm_yday
         return float(np.interp(day, [104, 135, 285, 320], [0, 1, 1, 0]))
 
@@ -239,47 +207,21 @@ class Conditions:
         The sun stands still during a drive (it moves 1° in four minutes); clouds pass over the
         robot every 50 to 300 m, and lamps come on one minute into civil twilight.
         """
-        if self.world is World.SIX:
-            return self._at_6(driven_m, elapsed_s)
-        weather = WEATHERS[self.weather]
-        sun = self._sun(0.0)
-        swing = _drift(self.seed, driven_m)
-        cloud = float(np.clip(weather.cloud + weather.changes * swing, 0, 1))
-        shade = _shade(cloud, _drift(self.seed + 1, driven_m))
-        rain = float(np.clip(weather.rain + 1.6 * weather.changes * swing, 0, 1))
-        rain = rain if weather.rain > 0 else 0.0
-        clear = clear_sky_power(float(sun[2]))
-        dusk_deg = float(np.degrees(np.arcsin(self._sun(elapsed_s)[2])))
-        lamps = dusk_deg < -1.0
-        return Moment(
-            sun_direction=sun if sun[2] > 0 else np.array([0.0, 0.0, 1.0]),
-            sun_power=clear_sun_power(float(sun[2])) * (1 - shade),
-            sky_power=clear * (1 + 0.9 * cloud - 0.45 * _darkening(rain)),
-            cloud=cloud,
-            cloud_shift=(0.31 * elapsed_s + 17.0 * (self.seed % 97), 0.07 * elapsed_s),
-            fog_per_m=weather.fog_per_m * (1 + 0.5 * swing * (weather.fog_per_m > 0.01)),
-            haze=0.9,
-            wet=weather.wet,
-            snow=weather.snow,
-            rain=rain,
-            lamps_on=lamps,
-            headlights_on=dusk_deg < 1.5 or weather.fog_per_m > 0.01 or rain > 0.1,
-        )
-
-    def _at_6(self, driven_m: float, elapsed_s: float) -> Moment:
-        """In world 6: rain is a rate, and lies on the road, in the air and under the clouds."""
-        weather, swing = WEATHERS_6[self.weather], _drift(self.seed, driven_m)
-        rate = weather.rain if self.rain_mm_h is None else self.rain_mm_h
+        weather, swing = WEATHERS[self.weather], _drift(self.seed, driven_m)
+        rate = weather.rain_mm_h if self.rain_mm_h is None else self.rain_mm_h
         rate *= max(0.0, 1 + 1.6 * weather.changes * swing)
         sun = self._sun(0.0)
         cloud = float(np.clip(weather.cloud + weather.changes * swing, 0, 1))
         shade = 1.0 if cloud > 0.97 else _shade(cloud, _drift(self.seed + 1, driven_m))
-        clear = clear_sky_power(float(sun[2]), _NIGHT_SKY_6)
         height_deg = float(np.degrees(np.arcsin(self._sun(elapsed_s)[2])))
+        dark = min(rate / 2.0, 1.0)  # how much of a rain cloud stands overhead
         return Moment(
             sun_direction=sun if sun[2] > 0 else np.array([0.0, 0.0, 1.0]),
             sun_power=clear_sun_power(float(sun[2])) * (1 - shade),
-            sky_power=clear * (1 + 0.9 * cloud - 0.45 * min(rate / 2.0, 1.0)),
+            sky_power=max(
+                clear_sky_power(float(sun[2])) * (1 + 0.9 * cloud - 0.45 * dark),
+                _TOWN_GLOW * (1 + _GLOW_OF_CLOUDS * cloud),
+            ),
             cloud=cloud,
             cloud_shift=(0.31 * elapsed_s + 17.0 * (self.seed % 97), 0.07 * elapsed_s),
             # Extinction by the drops themselves (Atlas 1953).
@@ -287,16 +229,10 @@ class Conditions:
             haze=0.9,
             wet=weather.wet,
             snow=weather.snow,
-            rain=0.0,
+            rain_mm_h=rate,
             lamps_on=height_deg < -1.0,
             headlights_on=height_deg < 1.5 or weather.fog_per_m > 0.01 or rate > 0.1,
-            rain_mm_h=rate,
             sun_deg=height_deg,
-            aureole=_AUREOLE_6,
-            lamp_power=_LAMP_POWER_6,
-            window=_WINDOW_6,
-            mirrors=_MIRRORS_6,
-            beam=_BEAM_6,
         )
 
     def _sun(self, elapsed_s: float) -> NDArray[np.float64]:
@@ -311,11 +247,6 @@ def _drift(seed: int, driven_m: float) -> float:
     phases = rng.uniform(0, 2 * np.pi, 3)
     waves = np.sin(2 * np.pi * driven_m / lengths_m + phases)
     return float(np.tanh(0.9 * waves.sum()))
-
-
-def _darkening(rain: float) -> float:
-    """How much of a rain cloud stands overhead, 0…1: all of it before the rain is half as hard."""
-    return min(rain / 0.4, 1.0)
 
 
 def _shade(cloud: float, drift: float) -> float:

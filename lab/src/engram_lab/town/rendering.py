@@ -14,11 +14,19 @@ from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram_lab import _town
 from engram_lab.town.camera_model import CLEAN, CameraModel, Lens
-from engram_lab.town.conditions import Conditions, Moment, World
+from engram_lab.town.conditions import (
+    AUREOLE,
+    BEAM,
+    LAMP_POWER,
+    MIRRORS,
+    WINDOW,
+    Conditions,
+    Moment,
+)
 from engram_lab.town.drive import EXACT, Pose, Residual, Robot, driving_line, pose_on, robot_named
 from engram_lab.town.mesh import Mesh
-from engram_lab.town.streets import Alteration, Junction, alterations_on, loop_of_length
-from engram_lab.town.textures import Style, style_of
+from engram_lab.town.streets import Junction, alterations_on, loop_of_length
+from engram_lab.town.textures import Style
 from engram_lab.town.town import Tile, Today, Town
 
 _AHEAD_M = 170.0  # how far tiles are kept around the camera
@@ -119,7 +127,7 @@ class TownRenderer:
         lamps = np.concatenate(places) if places and lamps_on else np.zeros((0, 3))
         rows = np.empty((len(lamps), 5), dtype=np.float32)
         rows[:, :3] = lamps
-        rows[:, 3:] = (moment.lamp_power, _LAMP_RANGE_M)
+        rows[:, 3:] = (LAMP_POWER, _LAMP_RANGE_M)
         self.town.scene.set_lamps(rows)
 
     def _set_moving(self, moving: Mesh | None) -> None:
@@ -150,25 +158,22 @@ def _light(moment: Moment, world_from_cam: SE3) -> _town.Light:
         haze=moment.haze,
         wet=moment.wet,
         snow=moment.snow,
-        headlights=moment.beam if moment.headlights_on else 0.0,
-        windows=moment.window if moment.lamps_on else 0.0,
-        aureole=moment.aureole,
-        mirrors=moment.mirrors,
+        headlights=BEAM if moment.headlights_on else 0.0,
+        windows=WINDOW if moment.lamps_on else 0.0,
+        aureole=AUREOLE,
+        mirrors=MIRRORS,
     )
 
 
 LOOP_M = 150.0
 _PLACES_EVERY_M = 5.0
-_FIRST_DAY = datetime(2025, 7, 1, tzinfo=UTC).toordinal()  # from which a world 6 changes
+_FIRST_DAY = datetime(2025, 7, 1, tzinfo=UTC).toordinal()  # from which a loop changes
 _IN_RAIN_S = 120.0  # how long it has rained on the glass when a place is seen
 
 
 @dataclass(frozen=True, slots=True)
 class Visit:
-    """One pass through the places: when, in what weather, on which day's parking.
-
-    In world 6 the rain may have another rate than the weather's.
-    """
+    """One pass through the places: when, in what weather or rain, on which day's parking."""
 
     name: str
     start: datetime
@@ -205,20 +210,19 @@ class Places:
         style: of its textures.
         robot: whose camera.
         every_m: way between places.
-        world: how light and weather are made.
         lens: of the robot.
         loop_m: length of the loop.
     """
 
     def __init__(
         self, seed: int = 1, style: Style | None = None, robot: str = "wildcat",
-        every_m: float = _PLACES_EVERY_M, world: World = World.FIVE, lens: Lens = CLEAN,
+        every_m: float = _PLACES_EVERY_M, lens: Lens = CLEAN,
         loop_m: float = LOOP_M,
     ) -> None:  # fmt: skip
-        self._world, self._lens = world, lens
+        self._lens = lens
         plan, route = loop_of_length(loop_m, seed)
         self.robot: Robot = robot_named(robot)
-        self._town = Town(plan, route, style or style_of(world))
+        self._town = Town(plan, route, style or Style())
         self._line = driving_line(plan, route, reverse=False)
         self._starts_m = np.arange(0, self._line.length_m, every_m)
 
@@ -249,10 +253,9 @@ class Places:
             luminance, inverse_depths = renderer.render(world_from_cam, camera, moment)
             twist = np.array([0, 0, 5.5, 0, 0, 0])
             pose = Pose(world_from_cam, float(start_m), 0.0, 5.5, twist)
-            seed = 1000 * visit.day + visit.start.hour
-            if self._world is World.SIX:  # each place's glass is its own
-                seed += 1_000_003 * (k + 1)
-            model = CameraModel(self.robot, seed, self._lens, self._world)
+            # Each place's glass is its own.
+            seed = 1000 * visit.day + visit.start.hour + 1_000_003 * (k + 1)
+            model = CameraModel(self.robot, seed, self._lens)
             model.stand_in(moment.rain_mm_h, pose.speed_m_s, _IN_RAIN_S)
             left, right = model.expose(luminance, inverse_depths, pose, moment, k)
             found.append((world_from_cam, StereoPair(k, left, right, camera)))
@@ -264,19 +267,11 @@ class Places:
         return [renderer.depth(pose, self.robot.camera)[0] for pose in world_from_cams]
 
     def _conditions(self, visit: Visit) -> Conditions:
-        return Conditions(
-            visit.start, visit.weather, visit.day, world=self._world, rain_mm_h=visit.rain_mm_h
-        )
-
-    def _changes(self, visit: Visit) -> frozenset[Alteration]:
-        """What has been built since the year began; in world 5 nothing is."""
-        if self._world is World.FIVE:
-            return frozenset()
-        return alterations_on(self._town.plan.seed, visit.start.toordinal() - _FIRST_DAY)
+        return Conditions(visit.start, visit.weather, visit.day, rain_mm_h=visit.rain_mm_h)
 
     def _renderer(self, visit: Visit) -> TownRenderer:
+        """Of the visit's day, with what has been built since the year began."""
         conditions = self._conditions(visit)
-        today = Today(
-            visit.day, conditions.hour, conditions.season, 0.45, self._changes(visit), self._world
-        )
+        built = alterations_on(self._town.plan.seed, visit.start.toordinal() - _FIRST_DAY)
+        today = Today(visit.day, conditions.hour, conditions.season, 0.45, built, conditions.leaves)
         return TownRenderer(self._town, today)

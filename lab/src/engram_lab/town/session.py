@@ -17,9 +17,8 @@ from engram.sequences.motion_files import Trajectory
 from engram.sequences.sequence import SequenceInfo
 from engram_lab.town.camera_model import CameraModel, Met
 from engram_lab.town.campaigns import Campaign, SessionPlan
-from engram_lab.town.conditions import Conditions, World
+from engram_lab.town.conditions import Conditions
 from engram_lab.town.drive import (
-    EXACT,
     DrivingStyle,
     Line,
     Pose,
@@ -32,7 +31,7 @@ from engram_lab.town.drive import (
 from engram_lab.town.mesh import FrameTruth, Mesh
 from engram_lab.town.rendering import TownRenderer
 from engram_lab.town.streets import Route, StreetPlan, alterations_on
-from engram_lab.town.textures import Style, style_of
+from engram_lab.town.textures import Style
 from engram_lab.town.town import Life, Today, Town
 
 _MOST_THREADS = 256  # of the core
@@ -62,11 +61,9 @@ class SimulatedDrive:
             self.plan.weather,
             self.plan.seed,
             campaign.place,
-            campaign.world,
             self.plan.rain_mm_h,
         )
-        six = campaign.world is World.SIX
-        self.residual = Residual.of_rig(self.robot.name, campaign.seed) if six else EXACT
+        self.residual = Residual.of_rig(self.robot.name, campaign.seed)
         self.met: list[Met] = []  # by the frames of the last pass
         self._threads = threads
         self._stage: TownRenderer | None = None
@@ -92,14 +89,12 @@ class SimulatedDrive:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[StereoPair]:
         """Pairs `start` to `stop`; the exposure settles again at the first."""
-        world = self.campaign.world
-        camera_model = CameraModel(self.robot, self.plan.seed, self.plan.lens, world)
+        camera_model = CameraModel(self.robot, self.plan.seed, self.plan.lens)
         self.met = []
-        if world is World.SIX:
-            self._drive_through_rain(camera_model, start)
+        self._drive_through_rain(camera_model, start)
         for k, pose in enumerate(self.poses[start:stop], start):
             moment = self.conditions.at(pose.driven_m, pose.elapsed_s)
-            if world is World.SIX and k > start:
+            if k > start:
                 seconds = pose.elapsed_s - self.poses[k - 1].elapsed_s
                 camera_model.stand_in(moment.rain_mm_h, pose.speed_m_s, seconds)
             luminance, inverse_depths = self._renderer().render(
@@ -145,12 +140,11 @@ class SimulatedDrive:
             self.conditions.season,
             float(np.clip(self.campaign.parked_share + rng.normal(0, 0.1), 0, 1)),
             alterations_on(self.campaign.seed, day - self.campaign.first_day),
-            self.campaign.world,
             self.conditions.leaves,
         )
 
     def _town(self) -> Town:
-        return _town_of(self._streets, self._route, style_of(self.campaign.world))
+        return _town_of(self._streets, self._route, Style())
 
     def _renderer(self) -> TownRenderer:
         if self._stage is None:
@@ -162,7 +156,7 @@ class SimulatedDrive:
         if self._life is None:
             self._life = Life(
                 self._town().cast, self._streets, self._driven, self.line, self.plan.reverse,
-                self.campaign.traffic, self.plan.seed, self.campaign.world,
+                self.campaign.traffic, self.plan.seed,
             )  # fmt: skip
         position = pose.world_from_cam.translation[:2]
         return self._life.around(position, pose.driven_m, pose.elapsed_s)

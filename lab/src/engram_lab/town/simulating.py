@@ -34,10 +34,11 @@ from engram.sequences.framelog.reader import FrameLog
 from engram.sequences.motion_files import write_tum
 from engram.sequences.sequence import LoggedFrame
 from engram_lab.town.camera_model import Met
-from engram_lab.town.campaigns import Campaign
-from engram_lab.town.conditions import World
+from engram_lab.town.campaigns import WORLD_VERSION, Campaign
 from engram_lab.town.session import SimulatedSequence
 from engram_lab.truth import truth_path
+
+MOST_LANDMARKS = 2000  # of a frame that a log keeps, so that other numbers need no rendering
 
 
 class Upkeep(Enum):
@@ -108,7 +109,8 @@ def _rewrite(log: FrameLog, draft: Path, header: FrameLogHeader, settings: Setti
     with FrameLogWriter(draft, header) as writer:
         for index, logged in enumerate(log):
             frame = replace(logged.frame, frontend=header.frontend)
-            writer.append(LoggedFrame(frame, engine.step(frame)), log.pair_hash(index))
+            step = engine.step(frame)
+            writer.append(LoggedFrame(frame, step), log.pair_hash(index), log.ranked(index))
 
 
 @dataclass(slots=True)
@@ -119,6 +121,7 @@ class SimulateReport:
     rendered: int = 0
     already_there: int = 0
     frames: int = 0
+    megabytes: float = 0.0  # of all sessions asked for
     files: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
@@ -129,7 +132,7 @@ class SimulateReport:
         """For people."""
         return (
             f"{self.rendered} sessions rendered ({self.frames} pairs), {self.already_there} were "
-            f"there already, in {self.folder}"
+            f"there already, {self.megabytes:.1f} MB, in {self.folder}"
         )
 
 
@@ -150,7 +153,7 @@ def campaigns_folder() -> Path:
 
 def campaign_folder(out: Path, campaign: Campaign) -> Path:
     """Where a campaign's sessions stand below `out`: by campaign, seed, size and world version."""
-    name = f"{campaign.home}-{campaign.size.value}-seed{campaign.seed}-v{campaign.world}"
+    name = f"{campaign.home}-{campaign.size.value}-seed{campaign.seed}-v{WORLD_VERSION}"
     return out / name
 
 
@@ -203,8 +206,15 @@ def simulate(
             shares = {f"share {first + 1}": tasks[first::workers] for first in range(workers)}
             run_in_processes(_render_share, shares, workers, part, lambda *_: None)
     report.frames = sum(lengths[task.session] for task in tasks)
+    report.megabytes = 1e-6 * sum(_size(task.target) for task in asked)
     report.rendered, report.already_there = len(tasks), len(asked) - len(tasks)
     return report
+
+
+def _size(target: Path) -> int:
+    """Bytes of a log, or of a folder of images."""
+    files = target.rglob("*") if target.is_dir() else [target]
+    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def _task(campaign: Campaign, number: int, folder: Path, images: bool, settings: Settings) -> _Task:
@@ -263,15 +273,14 @@ def _render(task: _Task, monitor: Monitor) -> None:
     truth_path(task.target).unlink(missing_ok=True)  # it says that the session is whole
     if _is_outdated(task.target):
         task.target.unlink()
-    report = extract_log(sequence, task.target, task.settings, Advancing(count))
+    report = extract_log(sequence, task.target, task.settings, Advancing(count), MOST_LANDMARKS)
     if report.interrupted:
         raise KeyboardInterrupt
     plan = sequence.drive.plan
     comments = [f"{plan.name}: {plan.weather}, {plan.start:%Y-%m-%d %H:%M} UTC, {plan.robot}"]
-    if task.campaign.world is World.SIX:
-        comments.append(f"rig: {sequence.drive.residual.text()}")
-        rows = [Met.HEADER, *(met.row() for met in sequence.drive.met)]
-        _write(met_path(task.target), ("\n".join(rows) + "\n").encode())
+    comments.append(f"rig: {sequence.drive.residual.text()}")
+    rows = [Met.HEADER, *(met.row() for met in sequence.drive.met)]
+    _write(met_path(task.target), ("\n".join(rows) + "\n").encode())
     write_tum(truth_path(task.target), sequence.truth(), comments)
 
 

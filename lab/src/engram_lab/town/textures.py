@@ -8,8 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from engram_lab.town.conditions import World
-
 Field = NDArray[np.float32]
 
 SIDE = 1024  # texels of a field; far larger than what is cut from it, so that cuts differ
@@ -81,21 +79,12 @@ WORDS = (
 class Style:
     """How much of what one sees is paint and how much is relief.
 
-    These two set how hard a change of light is, and were chosen by the calibration
-    (`lab/reports/town.md`), before any evaluation.
+    These two set how hard a change of light is; set by protocol R (`lab/reports/town.md`), before
+    any evaluation.
     """
 
-    paint_contrast: float = 0.21
-    relief: float = 2.2
-
-
-# World 6: a first value, to be calibrated by what low sun and night cost on real roads.
-_STYLE_6 = Style(paint_contrast=0.45, relief=1.3)
-
-
-def style_of(world: World) -> Style:
-    """Of a world's textures."""
-    return _STYLE_6 if world is World.SIX else Style()
+    paint_contrast: float = 0.37
+    relief: float = 1.7
 
 
 def pack(

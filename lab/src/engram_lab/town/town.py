@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram_lab import _town
-from engram_lab.town.conditions import World
 from engram_lab.town.drive import Line, closed_line, driving_line
 from engram_lab.town.furniture import (
     Foliage,
@@ -110,14 +109,12 @@ class Life:
         reverse: whether it drives the other way round.
         traffic: how much moves, 0…1.
         seed: of the session.
-        world: how near the car ahead comes.
     """
 
     def __init__(
         self, cast: Cast, plan: StreetPlan, route: Route, line: Line, reverse: bool,
-        traffic: float, seed: int, world: World = World.FIVE,
+        traffic: float, seed: int,
     ) -> None:  # fmt: skip
-        self._nearest_m = _QUEUED_M if world is World.SIX else 11.0
         rng = np.random.default_rng([seed & 0x7FFFFFFF, 0x11FE])
         self._cast = cast
         self._own = line
@@ -165,9 +162,7 @@ class Life:
     def _lead(self, driven_m: float) -> list[Mesh]:
         """A car ahead, which falls back and draws away out of sight in turns."""
         waves = np.sin(driven_m / np.array([140.0, 95.0]) + self._lead_phase).sum() / 2
-        gap_m = self._nearest_m + 75.0 * float(
-            np.clip(0.95 - 0.75 * self._traffic + 0.8 * waves, 0, 1.2)
-        )
+        gap_m = _QUEUED_M + 75.0 * float(np.clip(0.95 - 0.75 * self._traffic + 0.8 * waves, 0, 1.2))
         if gap_m > _SEEN_M:
             return []
         where, heading, _ = self._own.at(driven_m + gap_m)
@@ -200,7 +195,7 @@ _POOL = 16  # distinct coarse fronts
 _DEPTH_M = 8.5  # of terraced houses
 _PAVEMENT_M = 2.6  # where all are alike
 _BEHIND = 0.3  # how fast an end wall falls back behind the fronts round the corner, metres a metre
-_REBUILDS = 5  # of so many repainted fronts one is rebuilt in world 6
+_REBUILDS = 4  # of so many repainted fronts one is rebuilt
 _SHARED_STREET_M = 24.0  # after which the tarmac of side streets repeats
 
 
@@ -214,7 +209,6 @@ class Today:
         season: 0 leaves, 1 autumn, 2 bare.
         parked_share: of the parking places taken, 0…1.
         alterations: structural changes in force.
-        world: how life is made.
         leaves: share of the leaves that are out.
     """
 
@@ -223,7 +217,6 @@ class Today:
     season: int
     parked_share: float
     alterations: frozenset[Alteration] = frozenset()
-    world: World = World.FIVE
     leaves: float = 1.0
 
 
@@ -668,9 +661,7 @@ class _TileBuilder:
         return any(a.kind is kind and a.chooses(*house) for a in self.today.alterations)
 
     def _rebuilt(self, house: tuple[Junction, int]) -> bool:
-        """Whether works have changed a front: in world 6, after one alteration of five."""
-        if self.today.world is World.FIVE:
-            return False
+        """Whether works have changed a front."""
         return any(
             a.kind is AlterationKind.REPAINT and a.number % _REBUILDS == 0 and a.chooses(*house)
             for a in self.today.alterations

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.frontend.frame import StereoPair
+from engram_lab.town.glass import OPEN_GLASS, Glass, Pane, WetLens
 
 Image = NDArray[np.uint8]
 
@@ -201,20 +202,28 @@ def halved(pair: StereoPair, factor: float) -> StereoPair:
     return replace(on_both(pair, smaller), camera=fewer)
 
 
-def with_drops(pair: StereoPair, drops: float, rng: np.random.Generator) -> StereoPair:
-    """Drops on both lenses: blurred discs, in other places on each."""
+_RAINED_S, _SPEED_M_S = 120.0, 5.0  # for how long it has rained, and a robot's speed
 
-    def wet(image: Image) -> Image:
-        height, width = image.shape
-        mask = np.zeros(image.shape, np.float32)
-        for _ in range(round(drops)):
-            centre = (int(rng.integers(width)), int(rng.integers(height)))
-            cv2.circle(mask, centre, int(rng.integers(8, 30)), 1.0, -1)
-        soft = cv2.GaussianBlur(mask, (0, 0), 3.0)
-        through = cv2.blur(image, (27, 27)).astype(np.float32)
-        return np.asarray(image * (1 - soft) + through * soft, np.uint8)
 
-    return on_both(pair, wet)
+def rained_on(
+    pairs: Pairs, rate_mm_h: float, start: int, rng: Random, glass: Glass = OPEN_GLASS
+) -> list[Shown]:
+    """Rain on the panes of both lenses, two minutes' worth of it by the first frame concerned."""
+    camera, shown = pairs[0].camera, undisturbed(pairs)
+    eyes = [WetLens(Pane(glass, camera, [int(rng.integers(2**31))]), camera) for _ in range(2)]
+    seconds = _RAINED_S
+    for k in range(start, len(pairs)):
+        for eye in eyes:
+            eye.pane.advance(rate_mm_h, _SPEED_M_S, seconds)
+        sides = (pairs[k].left, pairs[k].right)
+        left, right = (
+            np.asarray(eye.through(side.astype(np.float32)), np.uint8)
+            for eye, side in zip(eyes, sides, strict=True)
+        )
+        shown[k] = Shown(k, replace(pairs[k], left=left, right=right))
+        following = pairs[min(k + 1, len(pairs) - 1)]
+        seconds = 1e-9 * (following.stamp_ns - pairs[k].stamp_ns)
+    return shown
 
 
 def with_car(pair: StereoPair, share: float, *_: object) -> StereoPair:
@@ -364,7 +373,15 @@ FAULTS: dict[str, Fault] = {
         Fault("exposure jump", "times", 1.5, 8.0, changed(_brighter, 10)),
         Fault("exposure drop", "times", 1.5, 20.0, changed(_darker, 10)),
         Fault("blackout", "frames", 1, 40, blackout),
-        Fault("lens drops", "drops", 10, 300, changed(lambda p, n, _, rng: with_drops(p, n, rng))),
+        Fault("rain on the lens", "mm/h", 0.5, 25.0, rained_on),
+        Fault(
+            "rain on an unwiped pane", "mm/h", 0.5, 25.0,
+            partial(rained_on, glass=Glass(distance_mm=40.0)),
+        ),
+        Fault(
+            "rain and a wiper", "mm/h", 0.5, 25.0,
+            partial(rained_on, glass=Glass(distance_mm=40.0, wiped_every_s=2.0)),
+        ),
         Fault("car ahead", "of the image", 0.1, 0.7, changed(with_car, 40)),
         Fault("kidnapped", "frames", 10, 60, kidnapped),
         Fault("fixed pattern", "of the image", 0.1, 0.6, fixed_pattern, True),
