@@ -336,7 +336,7 @@ def map_simulated(
         )
         loops = loop_search(opened, localiser, settings) if closes_loops else None
         with localiser, loops or nullcontext():
-            mapper = Mapper(opened.graph, localiser, saver, session, settings.mapper, loops)
+            mapper = Mapper(localiser.graph, localiser, saver, session, settings.mapper, loops)
             robot = Robot(Front(settings), localiser, mapper)
             steps = [robot.step(seen.logged) for seen in drive]
             mapper.finish()

@@ -51,7 +51,7 @@ def test_a_lost_robot_finds_the_same_places_by_stored_blocks(tmp_path: Path) -> 
     blocks, whole, _ = places()
     assert blocks == 0
     with Map.open(path, writes=True) as opened:
-        NodeWords.of_map(opened, vocabulary).keep_missing([])
+        NodeWords.of_map(opened, vocabulary).keep_missing()
     blocks, by_blocks, unreadable = places()
     assert blocks == city.nodes // PLACES_PER_BLOCK == 1
     assert np.array_equal(whole, by_blocks)

@@ -163,7 +163,7 @@ def test_words_go_along_and_make_no_difference_to_the_bytes(centre, tmp_path):
         nodes = [node.id for node in store.load().nodes]
         words = NodeWords.of_map(store, vocabulary)
         assert not words.stored(nodes)
-        words.keep_missing(nodes)
+        words.keep_missing()
         kept = words.stored(nodes)
     sent(keeping, tmp_path / "after.engram", "tod", depart_h=9.0)
     with Map.open(tmp_path / "after.engram") as store:

@@ -71,8 +71,8 @@ def test_what_may_close_a_loop_takes_as_much_in_a_large_map_as_in_a_small_one() 
     taken = []
     for nodes in (200, 4_000):
         graph, chain = map_with_a_chain(nodes)
-        with LoopSearch(graph, book=None, attempter=None, acceptance=AcceptanceConfig()) as loops:
-            before, node = (graph.node(index) for index in chain[-2:])
+        *saved, before, node = (graph.node(index) for index in chain)
+        with LoopSearch(graph, None, None, AcceptanceConfig(), saved=saved) as loops:
             loops._excluded(before)
             taken.append(taken_bytes(lambda: loops._excluded(node)))  # noqa: B023
             excluded = set(loops._excluded(node).tolist())

@@ -148,7 +148,7 @@ def test_a_mapping_robot_joins_nothing_by_a_fix_that_nothing_confirms(town: Path
         session = writer.session
         sink = RevisionSink(writer, opened.frames, None, Settings().placing)
         saver = Saver(sink, path_id(session.id))
-        mapper = Mapper(opened.graph, localiser, saver, session)
+        mapper = Mapper(localiser.graph, localiser, saver, session)
         robot = Robot(Front(Settings()), localiser, mapper)
         found = [robot.step(seen.logged) for seen in live]
         mapper.finish()

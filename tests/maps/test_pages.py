@@ -198,11 +198,12 @@ def test_hidden_nodes_are_not_there(town: Path) -> None:
 
 
 def test_lessons_basin_and_paths_are_the_same(opened: Map) -> None:
-    ours = _by_pages(opened, CAMERA.fx, LocaliserConfig())
-    theirs = _whole(opened, CAMERA.fx, LocaliserConfig())
+    paged, whole = opened.read_graph(), opened.graph
+    ours = _by_pages(opened, paged, CAMERA.fx, LocaliserConfig())
+    theirs = _whole(opened, whole, CAMERA.fx, LocaliserConfig())
     np.testing.assert_array_equal(ours.basin.rates, theirs.basin.rates)
-    numbers = np.arange(len(theirs.graph), dtype=np.int32)
-    nodes = np.array([ours.graph.index(one.id) for one in theirs.graph.nodes], np.int32)
+    numbers = np.arange(len(whole), dtype=np.int32)
+    nodes = np.array([paged.index(one.id) for one in whole.nodes], np.int32)
     np.testing.assert_array_equal(
         ours.lessons.log_odds_of(nodes), theirs.lessons.log_odds_of(numbers)
     )

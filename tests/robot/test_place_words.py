@@ -35,8 +35,7 @@ def path(tmp_path: Path) -> Path:
 
 def fill(path: Path) -> int:
     with Map.open(path, writes=True) as store:
-        nodes = [node.id for node in store.load().nodes]
-        return NodeWords.of_map(store, VOCABULARY).keep_missing(nodes)
+        return NodeWords.of_map(store, VOCABULARY).keep_missing()
 
 
 def count_nodes(path: Path) -> int:

@@ -267,6 +267,14 @@ class HalfEdges:
             np.concatenate([b_in_a[short], a_in_b[short]]),
         )
 
+    def and_those_of(self, other: HalfEdges) -> HalfEdges:
+        """These and the other half-edges."""
+        return HalfEdges(
+            np.concatenate([self.sources, other.sources]),
+            np.concatenate([self.targets, other.targets]),
+            np.concatenate([self.target_in_source, other.target_in_source]),
+        )
+
     def rows(self, rows: NDArray[np.bool_]) -> HalfEdges:
         """The half-edges selected by an (H,) bool mask."""
         return HalfEdges(self.sources[rows], self.targets[rows], self.target_in_source[rows])
@@ -353,7 +361,7 @@ class ExperienceGraph:
 
     def add_node(self, node: Node) -> int:
         """Add a node and return its dense index; a known node keeps its index."""
-        known = self._index.get(node.id)
+        known = self._find(node.id)
         if known is not None:
             return known
         self._bound = None
@@ -422,6 +430,7 @@ class ExperienceGraph:
             poses[:, 9:] = np.stack([edge.a_from_b.translation for edge in edges])
             kinds = np.array([_KIND_NUMBER[edge.kind] for edge in edges], np.uint8)
             self._link_all(np.array(ends, np.int32), kinds, poses, error_rows)
+            self._join_chains(np.array(ends, np.int32), kinds)
             return
         for (a, b), edge, error_row in zip(ends, edges, error_rows, strict=True):
             known = self._numbers(a, b, edge.kind) or [self._link(a, b, edge)]
@@ -494,6 +503,7 @@ class ExperienceGraph:
         error_rows = error_rows_of(table.poses, table.covariances)
         self._edges.add_table(table)
         self._link_all(table.ends, table.kinds, table.poses, error_rows)
+        self._join_chains(table.ends, table.kinds)
 
     def _link_all(
         self,
@@ -534,7 +544,6 @@ class ExperienceGraph:
         self._target.extend(np.ascontiguousarray(ends[:, ::-1]).ravel())
         last = np.roll(new_source, -1)
         self._first_half.rows[sources[order[last]]] = halves[last]
-        self._join_chains(ends, kinds)
 
     def _join_chains(self, ends: NDArray[np.int32], kinds: NDArray[np.uint8]) -> None:
         """Joins the experiences at the ends of odometry edges."""
@@ -607,6 +616,19 @@ class ExperienceGraph:
         """(N,) float64: odometry distance of each node from its session's start, metres. A view."""
         return self._driven_m.rows
 
+    def is_only_of(self, session: SessionId) -> bool:
+        """Whether no other session saved a node."""
+        return all(one == session for one in self._sessions)
+
+    def driven_m_of(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
+        """(Y,) float64: `driven_m` of nodes, given by (Y,) int32 dense indices."""
+        self._want(nodes)
+        return self._driven_m.rows.take(nodes)
+
+    def experiences_of(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
+        """(Y,) int32: `experiences` of nodes, given by (Y,) int32 dense indices."""
+        return self._experiences.rows.take(nodes)
+
     def sessions_of(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
         """(Y,) int32: the session numbers of nodes, given by (Y,) int32 dense indices."""
         self._want(nodes)
@@ -624,6 +646,10 @@ class ExperienceGraph:
         The number is the dense index of one of its nodes; it may change when chains are joined.
         """
         return self._experiences.rows
+
+    def edge(self, number: int) -> Edge:
+        """The edge with a number, such as a search gives; it may change between two frames."""
+        return self._edges[number]
 
     def find_edge(self, a: NodeId, b: NodeId, kind: EdgeKind) -> Edge | None:
         """The edge of this key; None if there is none, or an end is not in the graph."""
@@ -791,12 +817,19 @@ class ExperienceGraph:
         del end  # every one belongs to a node
         return iter(())
 
-    def ids(self, first: int) -> Iterator[NodeId | None]:
-        """The nodes from a dense index on; None for one that belongs to no node."""
-        return (node.id for node in self._nodes[first:])
+    def ids(self, first: int, end: int | None = None) -> Iterator[NodeId | None]:
+        """The nodes from a dense index up to another one; None for one that belongs to no node.
+
+        Any thread may ask.
+        """
+        return (node.id for node in self._nodes[first:end])
 
     def trim(self) -> None:
         """Gives back memory; only between two frames."""
+
+    def _find(self, node: NodeId) -> int | None:
+        """Dense index of a node; None if there is none."""
+        return self._index.get(node)
 
     def _want(self, nodes: NDArray[np.int32]) -> None:
         """Brings nodes into memory."""

@@ -120,8 +120,15 @@ class GraphPages(Protocol):
         """Dense index of a node; None if there is none."""
         ...
 
-    def ids(self, first: int) -> Iterator[NodeId | None]:
-        """The nodes from a dense index to the end; None for one that belongs to no node."""
+    def ids(self, first: int, end: int) -> Iterator[NodeId | None]:
+        """The nodes from a dense index up to another one; None for one that belongs to no node."""
+        ...
+
+    def experiences(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
+        """(Y,) int32: equal for nodes, (Y,) dense indices, of one chain of odometry edges.
+
+        Each is the dense index of a node of the chain.
+        """
         ...
 
     def unused(self, end: int) -> Iterator[int]:
@@ -175,6 +182,9 @@ class PagedGraph(ExperienceGraph):
         # of which at least one was added, too.
         self._added_at: defaultdict[int, dict[EdgeKey, Edge]] = defaultdict(dict)
         self._added: list[int] = []
+        # Of experiences that added edges have joined: the one whose number is used for both.
+        self._joined: dict[int, int] = {}
+        self._halves_of_map: tuple[float, HalfEdges] | None = None
 
     nodes = _refused("nodes")
     edges = _refused("edges")
@@ -214,10 +224,9 @@ class PagedGraph(ExperienceGraph):
                     self._added_at[end // PAGE][a, b, edge.kind] = edge
 
     def _join_experiences(self, a: int, b: int) -> None:
-        """Chains lead beyond what is in memory."""
-
-    def _join_chains(self, ends: NDArray[np.int32], kinds: NDArray[np.uint8]) -> None:
-        """See `_join_experiences`."""
+        one, other = self.experiences_of(np.array([a, b], np.int32)).tolist()
+        if one != other:
+            self._joined[max(one, other)] = min(one, other)
 
     # -- reading
 
@@ -227,6 +236,25 @@ class PagedGraph(ExperienceGraph):
         if found is None:
             raise InputError(f"node {node} is not in the graph")
         return found
+
+    def is_only_of(self, session: SessionId) -> bool:
+        """See `ExperienceGraph`."""
+        own = self._session_index.get(session)
+        pages = (self._pages.page(number) for number in range(-(-self._end // PAGE)))
+        kept = all((page.sessions == own).all() for page in pages)
+        return kept and all(node.session == session for node in self._nodes)
+
+    def experiences_of(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
+        """See `ExperienceGraph`."""
+        labels, kept = nodes.copy(), nodes < self._end
+        if kept.any():
+            labels[kept] = self._pages.experiences(nodes[kept])
+        return np.array([self._label(one) for one in labels.tolist()], np.int32)
+
+    def _label(self, experience: int) -> int:
+        while (same := self._joined.get(experience)) is not None:
+            experience = same
+        return experience
 
     def node(self, index: int) -> Node:
         """See `ExperienceGraph`."""
@@ -263,13 +291,13 @@ class PagedGraph(ExperienceGraph):
         )
 
     def half_edges(self, reach_m: float) -> HalfEdges:
-        """See `ExperienceGraph`: those of the whole map, read for this."""
-        ends, poses = self._pages.edges()
+        """See `ExperienceGraph`: those of the whole map, read at the first question."""
+        if self._halves_of_map is None or self._halves_of_map[0] != reach_m:
+            self._halves_of_map = reach_m, HalfEdges.between(*self._pages.edges(), reach_m)
         added = np.array(self._added, np.int64)
-        return HalfEdges.between(
-            np.concatenate([ends, self._target.rows.reshape(-1, 2)[added, ::-1]]),
-            np.concatenate([poses, self._a_from_b.rows[added]]),
-            reach_m,
+        ends = self._target.rows.reshape(-1, 2)[added, ::-1]
+        return self._halves_of_map[1].and_those_of(
+            HalfEdges.between(ends, self._a_from_b.rows[added], reach_m)
         )
 
     @property
@@ -293,10 +321,12 @@ class PagedGraph(ExperienceGraph):
         """See `ExperienceGraph`."""
         return self._pages.unused(min(end, self._end))
 
-    def ids(self, first: int) -> Iterator[NodeId | None]:
+    def ids(self, first: int, end: int | None = None) -> Iterator[NodeId | None]:
         """See `ExperienceGraph`."""
-        yield from self._pages.ids(first) if first < self._end else ()
-        yield from (node.id for node in self._nodes[max(first - self._end, 0) :])
+        end = len(self) if end is None else end
+        yield from self._pages.ids(first, min(end, self._end)) if first < self._end else ()
+        added = slice(max(first - self._end, 0), max(end - self._end, 0))
+        yield from (node.id for node in self._nodes[added])
 
     def predict(self, reference: int, node: int) -> tuple[SE3, NDArray[np.float64]] | None:
         """See `ExperienceGraph`; None, too, for nodes so far apart that no pose is certain."""

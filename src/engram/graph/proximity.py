@@ -168,8 +168,7 @@ def _passes(
     graph: ExperienceGraph, near: Neighbourhood, gap_m: float
 ) -> Iterator[NDArray[np.intp]]:
     """Rows of each experience, split by pass."""
-    driven = graph.driven_m[near.nodes]
-    experiences = graph.experiences[near.nodes]
+    driven, experiences = graph.driven_m_of(near.nodes), graph.experiences_of(near.nodes)
     order = np.lexsort((driven, experiences))
     if len(order) == 0:
         return
@@ -194,7 +193,7 @@ def _linked_lately(graph: ExperienceGraph, node: int, spacing_m: float) -> set[i
 
 def _along_chain(graph: ExperienceGraph, node: int, within_m: float) -> list[int]:
     """The nodes of a node's experience within a driven distance, including itself."""
-    driven = graph.driven_m
+    from_m = graph.node(node).driven_m
     members, frontier = {node}, [node]
     while frontier:
         here = frontier.pop()
@@ -203,7 +202,7 @@ def _along_chain(graph: ExperienceGraph, node: int, within_m: float) -> list[int
                 continue
             a, b = graph.index(edge.a), graph.index(edge.b)
             there = b if a == here else a
-            if there not in members and abs(driven[there] - driven[node]) < within_m:
+            if there not in members and abs(graph.node(there).driven_m - from_m) < within_m:
                 members.add(there)
                 frontier.append(there)
     return list(members)

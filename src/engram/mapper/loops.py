@@ -12,6 +12,7 @@ the same parked cars. A match waits until another one, farther along, agrees wit
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Self
@@ -120,6 +121,7 @@ class LoopSearch:
         graph: the experience graph; searched by the calling thread only.
         attempter: makes attempts, as of a lost robot: there is no prediction.
         yardstick: what matches in this map usually have; None: look-alikes are not detected.
+        saved: the drive's nodes that an interrupted run had saved.
     """
 
     def __init__(
@@ -130,6 +132,7 @@ class LoopSearch:
         acceptance: AcceptanceConfig,
         config: LoopConfig | None = None,
         yardstick: Yardstick | None = None,
+        saved: Sequence[Node] = (),
     ) -> None:
         self.config = config or LoopConfig()
         self._graph = graph
@@ -140,8 +143,12 @@ class LoopSearch:
         self._frames = 0
         self._asked: deque[tuple[int, Future[_Match | None]]] = deque()
         self._waiting: list[_Match] = []
-        # Own nodes, by dense index, within `own_exclusion_m`; None before the first question.
-        self._recent: deque[int] | None = None
+        # Own nodes within `own_exclusion_m`, by dense index, with the distance driven.
+        self._recent: deque[tuple[int, float]] = deque()
+        for node in reversed(saved):
+            if node.driven_m <= saved[-1].driven_m - self.config.own_exclusion_m:
+                break
+            self._recent.appendleft((graph.index(node.id), node.driven_m))
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="engram-loops")
 
     def __enter__(self) -> Self:
@@ -222,7 +229,7 @@ class LoopSearch:
 
     def _driven_m(self, edge: Edge) -> float:
         """Distance driven when the robot saved the new node."""
-        return float(self._graph.driven_m[self._graph.index(edge.b)])
+        return self._graph.node(self._graph.index(edge.b)).driven_m
 
     def _excluded(self, node: Node) -> NDArray[np.int64]:
         """(K,) int64: nodes known to be near this node, or just saved."""
@@ -230,19 +237,11 @@ class LoopSearch:
         near = self._graph.neighbourhood(
             index, SE3.identity(), np.zeros((6, 6)), Search(self.config.near_m, np.pi)
         )
-        return np.unique(np.concatenate([self._just_saved(index), near.nodes.astype(np.int64)]))
-
-    def _just_saved(self, index: int) -> NDArray[np.int64]:
-        """(K,) int64: this node and its session's last ones."""
-        graph = self._graph
-        if self._recent is None:  # of a session that is resumed there may be some
-            self._recent = deque(np.flatnonzero(graph.sessions == graph.sessions[index]).tolist())
-        else:
-            self._recent.append(index)
-        beyond_m = graph.driven_m[index] - self.config.own_exclusion_m
-        while self._recent and graph.driven_m[self._recent[0]] <= beyond_m:
+        self._recent.append((index, node.driven_m))
+        while self._recent and self._recent[0][1] <= node.driven_m - self.config.own_exclusion_m:
             self._recent.popleft()
-        return np.array(self._recent, np.int64)
+        just_saved = np.array([own for own, _ in self._recent], np.int64)
+        return np.unique(np.concatenate([just_saved, near.nodes.astype(np.int64)]))
 
     def _answer(self, question: _Question) -> _Match | None:
         """The best accepted match among the most likely places."""
@@ -260,7 +259,10 @@ class LoopSearch:
 
     def _matched(self, question: _Question, place: int) -> _Match | None:
         """The match with a place, if it is accepted."""
-        known = self._graph.node(place).id
+        # Its record is for the thread of the graph alone.
+        known = next(self._graph.ids(place, place + 1))
+        if known is None:
+            return None
         candidate = Candidate(place, known, None, guided=False, row=None)
         outcome = self._attempter.attempt(question.frame, question.node, 0, candidate)
         if outcome.damaged:

@@ -355,6 +355,9 @@ class VoteConfig:
         check_bounds(self)
 
 
+EdgeKey: TypeAlias = tuple[NodeId, NodeId, EdgeKind]
+
+
 class EdgeVotes:
     """Votes of the frames of one drive.
 
@@ -369,8 +372,8 @@ class EdgeVotes:
         self.config = config or VoteConfig()
         self.removals: list[Removal] = []
         self._graph = graph
-        self._against: Counter[int] = Counter()
-        self._agreeing: Counter[int] = Counter()
+        self._against: Counter[EdgeKey] = Counter()
+        self._agreeing: Counter[EdgeKey] = Counter()
 
     def count(self, stamp_ns: int, outcomes: Sequence[Outcome]) -> None:
         """Counts the votes of one localised frame, and distrusts what was contradicted too often.
@@ -385,17 +388,18 @@ class EdgeVotes:
         measured = [edge_through_live(best, other, EdgeKind.MATCH) for _, other in sure[1:]]
         goals = [self._graph.index(edge.b) for edge in measured]
         tree = self._graph.chains_from(self._graph.index(best.node), goals=goals)
-        against, agreeing = set[int](), set[int]()
+        against, agreeing = dict[EdgeKey, Edge](), dict[EdgeKey, Edge]()
         for edge, goal in zip(measured, goals, strict=True):
             if goal in tree.row_of and edge.a != edge.b:
-                chain = set(self._chain(tree, goal))
+                chain = self._chain(tree, goal)
                 (against if self._contradicts(edge, tree, goal) else agreeing).update(chain)
-        self._agreeing.update(agreeing)
-        self._against.update(against - agreeing)
-        for row in sorted(against - agreeing):
-            most = max(self.config.against, 2 * self._agreeing[row])
-            if self._against[row] >= most:
-                self._distrust(row, stamp_ns)
+        contradicted = {key: edge for key, edge in against.items() if key not in agreeing}
+        self._agreeing.update(agreeing.keys())
+        self._against.update(contradicted.keys())
+        for key, edge in contradicted.items():
+            most = max(self.config.against, 2 * self._agreeing[key])
+            if self._against[key] >= most:
+                self._distrust(key, edge, stamp_ns)
 
     def _sure(self, outcomes: Sequence[Outcome]) -> Iterator[tuple[int, Position]]:
         for outcome in outcomes:
@@ -411,24 +415,22 @@ class EdgeVotes:
         off_m = float(np.linalg.norm(pose.translation - edge.a_from_b.translation))
         return off_m > max(self.config.gross_m, self.config.sigmas * sigma_m)
 
-    def _chain(self, tree: ChainTree, goal: int) -> Iterator[int]:
+    def _chain(self, tree: ChainTree, goal: int) -> Iterator[tuple[EdgeKey, Edge]]:
         """Edges that matching made, on the path from the tree's root to a node."""
         row = tree.row_of[goal]
         while (half := int(tree.half_edges[row])) >= 0:
-            if self._graph.edges[half // 2].kind is not EdgeKind.ODOMETRY:
-                yield half // 2
+            edge = self._graph.edge(half // 2)
+            if edge.kind is not EdgeKind.ODOMETRY:
+                yield (edge.a, edge.b, edge.kind), edge
             row = int(tree.parents[row])
 
-    def _distrust(self, row: int, stamp_ns: int) -> None:
-        edge, count = self._graph.edges[row], self._against.pop(row)
+    def _distrust(self, key: EdgeKey, edge: Edge, stamp_ns: int) -> None:
+        count = self._against.pop(key)
         self._graph.add_edge(replace(edge, covariance=_NOWHERE))
         reason = f"{count} frames of a drive that matched nodes on both sides contradict it"
         self.removals.append(
             Removal(edge.a, edge.b, edge.kind, edge.a_from_b, reason, removed_ns=stamp_ns)
         )
-
-
-EdgeKey: TypeAlias = tuple[NodeId, NodeId, EdgeKind]
 
 
 @dataclass(frozen=True, slots=True)
@@ -501,7 +503,7 @@ class Mapper(Memory):
         self._loops = loops
         # Whether the nodes being saved are connected to the rest of the map, and the distance
         # at which the disconnected part began.
-        self._joined = bool((graph.sessions == graph.session_number(session.id)).all())
+        self._joined = graph.is_only_of(session.id)
         self._alone_from_m = localiser.driven_m
         self._graph = graph
         self._session = session

@@ -45,10 +45,20 @@ from engram.maps.rows import (
     uuid_from_bytes,
     verified,
 )
-from engram.maps.schema import attempts, edges, nodes, path_entries, paths, removals, revisions
+from engram.maps.runs import Runs
+from engram.maps.schema import (
+    attempts,
+    edges,
+    nodes,
+    path_entries,
+    paths,
+    removals,
+    revisions,
+    sessions,
+)
 from engram.maps.sqlite import SqliteDatabase, reading_rows
-from engram.maps.totals import own_rows
-from engram.maps.view import View
+from engram.maps.totals import count_all, own_rows, state_at_head
+from engram.maps.view import View, head
 
 # Dense indices are of 32 bits; what a process adds follows after those of the map.
 _LARGEST_KEY = 2**31 - 2**24
@@ -113,17 +123,50 @@ class MapPages:
             return None
         return int(row[0]) - 1
 
-    def ids(self, first: int) -> Iterator[NodeId | None]:
+    def ids(self, first: int, end: int) -> Iterator[NodeId | None]:
         """See `GraphPages`."""
-        for start in range(first, self.end, _MANY):
-            end = min(start + _MANY, self.end)
-            keys = {"first": start + 1, "last": end}
+        for start in range(first, end, _MANY):
+            stop = min(start + _MANY, end)
+            keys = {"first": start + 1, "last": stop}
             found = {
                 key: node_from_bytes(uuid)
                 for key, revision, uuid in self._database.rows(_IDS, keys)
                 if self._visible.has(nodes, key, revision)
             }
-            yield from (found.get(index + 1) for index in range(start, end))
+            yield from (found.get(index + 1) for index in range(start, stop))
+
+    def experiences(self, nodes: NDArray[np.int32]) -> NDArray[np.int32]:
+        """See `GraphPages`."""
+        at = self._runs.find(nodes.astype(np.int64) + 1)
+        if (at < 0).any():
+            raise MapCorruptError(
+                f"{self._database.name}: node {int(nodes[at < 0][0]) + 1} is in no run of nodes; "
+                "run engram check"
+            )
+        return (self._runs.experience[at] - 1).astype(np.int32)
+
+    @cached_property
+    def _runs(self) -> Runs:
+        """The runs of all visible nodes; components without the edges of an open revision."""
+        view = self._view
+        with self._database.reading() as connection:
+            found = None
+            if view.at == head(connection):
+                _, found = state_at_head(connection, view.at)
+            if found is None:
+                found = count_all(connection, View(view.at))[1]
+            own = select(sessions.c.key).where(sessions.c.revision == view.own)
+            written = select(nodes.c.key).where(
+                nodes.c.session.in_(own), nodes.c.revision == view.own
+            )
+            keys = np.array(sorted(connection.execute(written).scalars()), np.int64)
+            if not len(keys):
+                return found
+            ends = {"first": int(keys[0]), "last": int(keys[-1])}
+            steps = [tuple(row) for row in connection.execute(_OWN_STEPS, ends | {"own": view.own})]
+        chained = np.array(steps, np.int64).reshape(-1, 2)
+        chained = chained[np.isin(chained, keys).all(axis=1)]
+        return found.with_nodes(keys).joined(chained, chained)
 
     def unused(self, end: int) -> Iterator[int]:
         """See `GraphPages`; asks for the ranges of revisions, and for keys where they have gaps."""
@@ -131,7 +174,8 @@ class MapPages:
         for first, last, whole in sorted(self._ranges()):
             yield from range(next_key - 1, min(first - 1, end))
             if not whole:
-                found = zip(range(first - 1, min(last, end)), self.ids(first - 1), strict=False)
+                stop = min(last, end)
+                found = zip(range(first - 1, stop), self.ids(first - 1, stop), strict=True)
                 yield from (index for index, node in found if node is None)
             next_key = last + 1
         yield from range(next_key - 1, end)
@@ -331,6 +375,11 @@ _IDS = select(nodes.c.key, nodes.c.revision, nodes.c.uuid).where(nodes.c.key.bet
 _STEPS = select(*edges.columns).where(
     edges.c.a.between(_FIRST, _LAST),
     edges.c.b.between(_FIRST, _LAST),
+    edges.c.kind == literal_column(f"'{EdgeKind.ODOMETRY}'"),
+)
+_OWN_STEPS = select(edges.c.a, edges.c.b).where(
+    edges.c.a.between(_FIRST, _LAST),
+    edges.c.revision == bindparam("own"),
     edges.c.kind == literal_column(f"'{EdgeKind.ODOMETRY}'"),
 )
 _OF_SESSION = select(*attempts.columns).where(attempts.c.session == bindparam("session"))

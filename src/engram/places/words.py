@@ -151,7 +151,7 @@ class NodeWords:
 
     def keep_missing(
         self,
-        nodes: Sequence[NodeId],
+        nodes: Sequence[NodeId] | None = None,
         monitor: Monitor = QUIET,
         *,
         brought: NodeWords | None = None,
@@ -161,6 +161,7 @@ class NodeWords:
         Damaged nodes are left out. If stopped early, the progress is kept.
 
         Args:
+            nodes: None for all of the map, but those whose place is in a stored block.
             monitor: receives the stage `words`, one item per node.
             brought: words by the same vocabulary that another map stores, which are taken over.
 
@@ -168,7 +169,7 @@ class NodeWords:
             Number of nodes whose words were stored.
         """
         assert self._store is not None
-        count = 0
+        nodes, count = self._missing(self._store) if nodes is None else nodes, 0
         with monitor.stage("words", len(nodes)) as stage:
             for part in (nodes[at : at + _BATCH] for at in range(0, len(nodes), _BATCH)):
                 known = self.stored(part)
@@ -186,6 +187,18 @@ class NodeWords:
         self._keep_blocks(self._store, monitor)
         return count
 
+    def _missing(self, store: Map) -> list[NodeId]:
+        """The nodes without stored words, behind the stored blocks."""
+        pages, missing, known = store.pages, list[NodeId](), 0
+        if pages.end >= PLACES_PER_BLOCK:
+            known = store.place_blocks(self.hash, FabMap(self.vocabulary).stored_as).count
+        for first in range(known * PLACES_PER_BLOCK, pages.end, PLACES_PER_BLOCK):
+            end = min(first + PLACES_PER_BLOCK, pages.end)
+            stored = self.of_keys(first + 1, end)
+            nodes = enumerate(pages.ids(first, end), first + 1)
+            missing += [node for key, node in nodes if node is not None and key not in stored]
+        return missing
+
     def _keep_blocks(self, store: Map, monitor: Monitor) -> None:
         """Stores the missing full blocks of FAB-MAP's places, of nodes that stay."""
         due = store.settled_nodes // PLACES_PER_BLOCK
@@ -197,7 +210,7 @@ class NodeWords:
             for number in range(first, due):
                 at = number * PLACES_PER_BLOCK
                 known = self.of_keys(at + 1, at + PLACES_PER_BLOCK)
-                nodes = islice(store.pages.ids(at), PLACES_PER_BLOCK)
+                nodes = store.pages.ids(at, at + PLACES_PER_BLOCK)
                 shown = [
                     known.get(key) if node is None or key in known else self._work_out(node)
                     for key, node in enumerate(nodes, at + 1)

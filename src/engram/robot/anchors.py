@@ -35,7 +35,7 @@ from engram.mapper.loops import edges_agree
 from engram.maps.map import Map
 from engram.maps.map_frame import FARTHEST_M, ORIGIN, MapFrame, Moves, changed, local_m, moves
 from engram.monitor import QUIET, Monitor
-from engram.robot.localisers import DriveSequence, graph_in, relocaliser_in
+from engram.robot.localisers import DriveSequence, relocaliser_in
 from engram.robot.settings import Settings
 from engram.sequences.bags.bag_sequence import BagSequence
 from engram.sequences.bags.containers import is_bag
@@ -293,64 +293,44 @@ class ReceiverFix:
         return None if latest is None or abs(time_ns - latest.time_ns) > _APART_NS else latest
 
 
-def relocaliser_with_fixes(
-    opened: Map,
-    sequence: DriveSequence,
-    settings: Settings,
-    name: str | None,
-    *,
-    saves: bool = False,
-) -> str | Relocaliser | None:
-    """The relocaliser of a drive, which also proposes nodes near its satellite fixes.
+NewestFix = Callable[[int], Fix | None]
 
-    Args:
-        opened: the map; fixes propose nothing in one that is not anchored to the earth.
-        sequence: the drive; only bags hold fixes.
-        settings: `localiser.fix_sigmas` says how far from a fix nodes are proposed.
-        name: one of `relocaliser_names()`; None for none.
-        saves: see `LocaliserParts`.
 
-    Returns:
-        `name`, if there are no fixes to use.
-    """
-    if not isinstance(sequence, BagSequence) or not settings.localiser.fix_sigmas:
-        return name
-    fixes = sequence.fixes()
-    return (
-        name if fixes is None else suggesting(opened, LatestFix(fixes), settings, name, saves=saves)
-    )
+def fixes_of(sequence: DriveSequence) -> NewestFix | None:
+    """The newest satellite fix of a drive at a time, ns; None if it has none: only bags do."""
+    fixes = sequence.fixes() if isinstance(sequence, BagSequence) else None
+    return None if fixes is None else LatestFix(fixes)
 
 
 def suggesting(
     opened: Map,
-    latest: Callable[[int], Fix | None],
+    latest: NewestFix | None,
     settings: Settings,
     name: str | None,
-    *,
-    saves: bool = False,
+    graph: ExperienceGraph,
 ) -> str | Relocaliser | None:
     """A relocaliser that also proposes nodes near a receiver's newest fix.
 
     Args:
         opened: the map; fixes propose nothing in one that is not anchored to the earth.
-        latest: the newest fix at a time, ns; None without one.
+        latest: the newest fix at a time, ns; None if there are none.
         settings: `localiser.fix_sigmas` says how far from a fix nodes are proposed.
         name: one of `relocaliser_names()`; None for none.
-        saves: see `LocaliserParts`.
+        graph: the graph of the localiser.
 
     Returns:
         `name`, if fixes are not to be used.
     """
     sigmas = settings.localiser.fix_sigmas
-    if not sigmas or opened.frame.origin is None:
+    if latest is None or not sigmas or ORIGIN not in opened.statistics():
         return name
-    graph, descriptor = graph_in(opened, saves=saves), settings.frontend.descriptor
+    descriptor = settings.frontend.descriptor
     inner = None if name is None else relocaliser_in(opened, name, descriptor, graph)
     return Suggested(inner, nodes_near(opened, graph, latest, sigmas))
 
 
 def nodes_near(
-    opened: Map, graph: ExperienceGraph, latest: Callable[[int], Fix | None], sigmas: float
+    opened: Map, graph: ExperienceGraph, latest: NewestFix, sigmas: float
 ) -> Callable[[Frame], list[int]]:
     """The nodes near the newest fix, for `Suggested`.
 

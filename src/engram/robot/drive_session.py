@@ -22,13 +22,13 @@ from engram.errors import MapError, MapLockedError
 from engram.frontend.frame import DescriptorKind, Frame, StereoPair
 from engram.frontend.frontend import Frontend
 from engram.geometry.cameras import StereoCamera
-from engram.graph.model import Clock, NodeId, PathEntry, Removal, Session, SessionId, path_id
+from engram.graph.model import Clock, Node, NodeId, PathEntry, Removal, Session, SessionId, path_id
 from engram.graph.placing import PlacingConfig
 from engram.localiser.acceptance import Rule
 from engram.localiser.attempts import Attempter, Lanes
 from engram.localiser.localisation import NO_SINK, ResultSink
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, Localiser
-from engram.localiser.relocalisation import ByAppearance, Relocaliser, Suggested
+from engram.localiser.relocalisation import ByAppearance, Suggested
 from engram.localiser.yardstick import Yardstick
 from engram.mapper.loops import LoopConfig, LoopSearch
 from engram.mapper.mapper import Mapper, Memory, Records, Saver
@@ -39,6 +39,7 @@ from engram.maps.writer import RevisionWriter
 from engram.places.recognisers import recogniser_names
 from engram.places.words import NodeWords, words_of
 from engram.ranking.context import RankingPolicy
+from engram.robot.anchors import NewestFix, suggesting
 from engram.robot.front import Arrived
 from engram.robot.localisers import DriveSequence, drives_of, localiser_in
 from engram.robot.settings import RobotOptions, Settings
@@ -57,6 +58,7 @@ class RobotSetup:
     Attributes:
         name: name of the robot; None for one that saves nothing.
         session: the drive, if known before the first frame.
+        fix: the newest satellite fix at a time, near which nodes are proposed; None for none.
         known: sessions of the map, where a drive that was interrupted may be played again: what
             comes is another session.
     """
@@ -66,7 +68,7 @@ class RobotSetup:
     options: RobotOptions
     name: str | None = None
     session: Session | None = None
-    relocaliser: str | Relocaliser | None = None
+    fix: NewestFix | None = None
     policy: RankingPolicy | None = None
     known: frozenset[SessionId] = frozenset()
 
@@ -74,14 +76,16 @@ class RobotSetup:
         self, opened: Map, *, maps: bool = False, remembers: bool = False
     ) -> Localiser:
         """The localiser of the drive."""
-        options = self.options
+        options, graph = self.options, opened.read_graph()
+        finder = suggesting(opened, self.fix, self.settings, options.relocaliser, graph)
         return localiser_in(
             opened,
             self.camera,
             self.settings,
             policy=self.policy or options.ranking,
             budget=options.budget,
-            relocaliser=self.relocaliser or options.relocaliser,
+            relocaliser=finder,
+            graph=graph,
             live=UNNAMED_LIVE_SESSION if self.session is None else self.session.id,
             saves=maps,
             threads=options.lane_threads(maps=maps, remembers=remembers),
@@ -234,7 +238,7 @@ class DriveSession:
         session, stored, mapper = writer.session, writer.stored, settings.mapper
         opened.derived(drives_of)[session.id] = session
         sink = RevisionSink(writer, opened.frames, words, settings.placing)
-        loops = loop_search(opened, localiser, settings)
+        loops = loop_search(opened, localiser, settings, stored.nodes)
         saver = Saver(
             sink, path_id(session.id), mapper.checkpoint_every, waits=waits, last=stored.last_entry
         )
@@ -377,12 +381,18 @@ def node_words(opened: Map, settings: Settings, relocaliser: str | None) -> Node
     if relocaliser not in recogniser_names():
         return None
     words = opened.derived(words_of, settings.frontend.descriptor)
-    words.keep_missing([node.id for node in opened.graph.nodes])
+    words.keep_missing()
     return words
 
 
-def loop_search(opened: Map, localiser: Localiser, settings: Settings) -> LoopSearch | None:
-    """Loop search by the words of the relocaliser; None if it has none."""
+def loop_search(
+    opened: Map, localiser: Localiser, settings: Settings, saved: Sequence[Node] = ()
+) -> LoopSearch | None:
+    """Loop search by the words of the relocaliser; None if it has none.
+
+    Args:
+        saved: what an interrupted run had saved.
+    """
     finder = localiser.relocaliser
     if isinstance(finder, Suggested):
         finder = finder.inner
@@ -398,6 +408,7 @@ def loop_search(opened: Map, localiser: Localiser, settings: Settings) -> LoopSe
         matching.acceptance,
         LoopConfig(near_m=matching.search_radius_m, own_exclusion_m=matching.own_exclusion_m),
         Yardstick(localiser.graph, attempter.frame, matching.matcher) if told else None,
+        saved,
     )
 
 

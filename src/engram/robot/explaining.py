@@ -197,7 +197,7 @@ def _explained(
     drives = _drives(opened)
     candidates = []
     for row in order.tolist():
-        node = opened.graph.node(int(near.nodes[row]))
+        node = context.graph.node(int(near.nodes[row]))
         candidates.append(
             ExplainedCandidate(
                 node=node.id,

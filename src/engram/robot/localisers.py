@@ -16,6 +16,7 @@ from engram.graph.clock import Clocked
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Session, SessionId, path_id
 from engram.graph.neighbourhood import Neighbourhood
+from engram.graph.pages import PagedGraph
 from engram.graph.paths import Evidence, PathMemory
 from engram.localiser.attempts import Matcher
 from engram.localiser.localisation import Budget
@@ -39,7 +40,9 @@ class LocaliserParts(TypedDict, total=False):
         policy: key of `POLICIES`, or a policy.
         budget: attempts per frame; None for 2 lanes × 2 rounds.
         relocaliser: one of `relocaliser_names()`, or one that several drives share; None for none.
-        saves: whether the session is being mapped: in the whole graph, which grows.
+        saves: whether the session is being mapped.
+        graph: the graph in which it localises, and which grows where it maps; None for one of its
+            own by pages. Of `Map.graph` paths, lessons and attempts are read whole.
         threads: how many threads the lanes share; None for one each.
         matcher, search: replace the default ones; see `Localiser` and `MapParts`.
         clock: time zone and location of its stamps; None if unknown.
@@ -53,6 +56,7 @@ class LocaliserParts(TypedDict, total=False):
     matcher: Matcher | None
     threads: int | None
     search: Callable[..., Neighbourhood] | None
+    graph: ExperienceGraph | None
     clock: Clocked | None
 
 
@@ -70,12 +74,14 @@ def localiser_in(
     ranking = policy_named(policy) if isinstance(policy, str) else policy
     descriptor = settings.frontend.descriptor
     words = opened.derived(words_of, descriptor)
-    known = (_whole if parts.get("saves") else _by_pages)(opened, camera.fx, settings.localiser)
+    graph = parts.get("graph") or opened.read_graph()
+    learn = _by_pages if isinstance(graph, PagedGraph) else _whole
+    known = learn(opened, graph, camera.fx, settings.localiser)
     background = Background(opened.derived(drives_of), known.lessons, words, opened.cameras)
     if uses_words(ranking):
         words.prepare()
     return Localiser(
-        MapParts(known.graph, known.paths, opened.frames, background, parts.get("search")),
+        MapParts(graph, known.paths, opened.frames, background, parts.get("search")),
         LiveDrive(
             known.basin,
             parts.get("live", UNNAMED_LIVE_SESSION),
@@ -84,7 +90,7 @@ def localiser_in(
         ),
         policy=ranking,
         budget=parts.get("budget") or Budget(),
-        relocaliser=relocaliser_in(opened, relocaliser, descriptor, known.graph)
+        relocaliser=relocaliser_in(opened, relocaliser, descriptor, graph)
         if isinstance(relocaliser, str)
         else relocaliser,
         config=settings.localiser,
@@ -124,26 +130,22 @@ def lessons_of(opened: Map, focal_px: float, config: LocaliserConfig) -> Lessons
     return Lessons.learnt(opened.graph, opened.path_memory, viewers, made, rates, config.lessons)
 
 
-def graph_in(opened: Map, *, saves: bool) -> ExperienceGraph:
-    """What a localiser searches: a map by pages; where it saves, the whole graph, which grows."""
-    return opened.graph if saves else opened.read_graph()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Known:
-    """What a localiser reads of nodes, edges, paths and attempts."""
+    """What a localiser reads of paths and attempts."""
 
-    graph: ExperienceGraph
     paths: PathMemory
     lessons: Lessons | PagedLessons
     basin: MatchBasin
 
 
-def _by_pages(opened: Map, focal_px: float, config: LocaliserConfig) -> _Known:
-    graph, pages = opened.read_graph(), opened.pages
+def _by_pages(
+    opened: Map, graph: ExperienceGraph, focal_px: float, config: LocaliserConfig
+) -> _Known:
+    pages = opened.pages
     basin, evidence = opened.derived(_past_drives, focal_px, config.basin)
     paths = PathMemory(graph, config.path_entries.kinds, pages)
-    return _Known(graph, paths, PagedLessons(evidence, pages.end, config.lessons), basin)
+    return _Known(paths, PagedLessons(evidence, pages.end, config.lessons), basin)
 
 
 def _past_drives(
@@ -153,9 +155,9 @@ def _past_drives(
     return basin, opened.pages.evidence(basin)
 
 
-def _whole(opened: Map, focal_px: float, config: LocaliserConfig) -> _Known:
+def _whole(opened: Map, graph: ExperienceGraph, focal_px: float, config: LocaliserConfig) -> _Known:
+    assert graph is opened.graph
     return _Known(
-        opened.graph,
         opened.path_memory.counting(config.path_entries.kinds),
         opened.derived(lessons_of, focal_px, config),
         MatchBasin.of(focal_px, opened.basin_counts, config.basin),

@@ -29,7 +29,7 @@ from engram.maps.records import SessionState
 from engram.monitor import QUIET, Monitor, deferred_interrupt, interruptible
 from engram.odometry.outside import MotionSource, OutsideMotion
 from engram.odometry.step import OdometryStatus
-from engram.robot.anchors import relocaliser_with_fixes
+from engram.robot.anchors import fixes_of
 from engram.robot.drive_session import DriveSession, RobotSetup, node_words
 from engram.robot.front import Arrived, Front, arriving, stamp_of
 from engram.robot.localisers import DriveSequence, session_of_drive
@@ -333,6 +333,7 @@ def map_drive(
         settings = settings.for_descriptor(None if opened is None else opened.descriptor)
         into = _written(map_path) if opened is None else nullcontext(opened)
         setup = RobotSetup(sequence.camera, settings, options, session.robot, session)
+        setup = replace(setup, fix=fixes_of(sequence))
         front = Front(settings)
         front.examination.evidence.facts = facts_of(sequence)
         try:
@@ -382,8 +383,7 @@ def _save(
     writer = header.begin_or_resume(opened)
     relocaliser = setup.options.relocaliser
     words = node_words(opened, settings, relocaliser)
-    finder = relocaliser_with_fixes(opened, sequence, settings, relocaliser, saves=True)
-    localiser = replace(setup, relocaliser=finder).localiser_in(opened, maps=True)
+    localiser = setup.localiser_in(opened, maps=True)
     saved = DriveSession.mapped(opened, writer, localiser, settings, words)
     robot = Robot(front, localiser, saved.result_sink, deadline_ms=setup.options.deadline_ms)
     begin(Beginning(opened, robot, report.resumed))

@@ -545,7 +545,7 @@ class DisplayPose:
 
     def _along_graph(self, node: NodeId) -> SE3 | None:
         graph, placed = self._graph, self._placed
-        asked = node, len(graph.edges)
+        asked = node, graph.edge_count
         if placed is None or asked == self._asked or node not in graph or placed not in graph:
             return None
         self._asked = asked

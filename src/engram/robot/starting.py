@@ -18,7 +18,7 @@ from engram.measures import Drive, failure, longest_gap_m, route_m, route_not_lo
 from engram.monitor import QUIET, Monitor
 from engram.odometry.motion import driven_steps_m
 from engram.ranking.context import RankingPolicy
-from engram.robot.anchors import ReceiverFix, relocaliser_with_fixes, suggesting
+from engram.robot.anchors import NewestFix, fixes_of
 from engram.robot.drive_session import (
     LiveDrive,
     RobotSetup,
@@ -58,7 +58,7 @@ def robot_on(
         options,
         session.robot,
         session,
-        relocaliser_with_fixes(opened, sequence, settings, options.relocaliser),
+        fixes_of(sequence),
         policy,
     )
     if remembers:
@@ -73,7 +73,7 @@ def robot_in(
     maps: bool = False,
     remembers: bool = False,
     front: Front | None = None,
-    fix: ReceiverFix | None = None,
+    fix: NewestFix | None = None,
 ) -> Robot:
     """A live robot; see `Map.robot`.
 
@@ -83,29 +83,17 @@ def robot_in(
         raise InputError(f"camera is {setup.camera!r}, must be an engram.StereoCamera")
     if setup.name is not None:
         check_name(setup.name)
-    setup = replace(setup, settings=setup.settings.for_descriptor(opened.descriptor))
+    setup = replace(setup, settings=setup.settings.for_descriptor(opened.descriptor), fix=fix)
     saving = _saving_in(opened, setup, maps=maps) if maps or remembers else None
     if saving is not None and saving.recovered:  # their drives may be played again
         setup = replace(setup, known=frozenset(opened.sessions))
-    if saving is not None and maps and (live := _mapped(opened, setup, saving, fix)) is not None:
+    if saving is not None and maps and (live := _mapped(opened, setup, saving)) is not None:
         return _robot(setup, opened, live, front)
-    setup = _with_fix(setup, opened, fix)
     live = None if saving is None else LiveDrive(setup, opened, maps=False, saving=saving)
     return _robot(setup, opened, live, front)
 
 
-def _with_fix(
-    setup: RobotSetup, opened: Map, fix: ReceiverFix | None, *, saves: bool = False
-) -> RobotSetup:
-    if fix is None:
-        return setup
-    settings, name = setup.settings, setup.options.relocaliser
-    return replace(setup, relocaliser=suggesting(opened, fix, settings, name, saves=saves))
-
-
-def _mapped(
-    opened: Map, setup: RobotSetup, saving: Saving, fix: ReceiverFix | None
-) -> LiveDrive | None:
+def _mapped(opened: Map, setup: RobotSetup, saving: Saving) -> LiveDrive | None:
     """The drive as it is mapped; None where the map cannot be written: the robot localises alone.
 
     Raises:
@@ -113,10 +101,7 @@ def _mapped(
     """
     try:
         commit_spools(Path(opened.location))
-        written = open_map(opened.location)
-        return LiveDrive(
-            _with_fix(setup, written, fix, saves=True), written, maps=True, saving=saving
-        )
+        return LiveDrive(setup, open_map(opened.location), maps=True, saving=saving)
     except MapLockedError:
         raise
     except MapError as error:  # on a read-only disk it localises, as on a full one

@@ -16,7 +16,6 @@ from engram.counts import counted
 from engram.errors import IncompatibleError, InputError, MapCorruptError
 from engram.frontend.frame import BRIEF, DescriptorKind, Frame, FrameStatus
 from engram.frontend.frontend import Frontend
-from engram.graph.model import NodeId
 from engram.maps.map import Map
 from engram.monitor import QUIET, Monitor
 from engram.places.vocabulary import (
@@ -121,7 +120,7 @@ def train_map_vocabulary(
             message=f"vocabulary of {len(vocabulary)} words",
             configuration={"vocabulary": to_dict(config), "trained_on": trained_on},
         )
-        NodeWords.of_map(writable, vocabulary).keep_missing(_node_ids(writable), monitor)
+        NodeWords.of_map(writable, vocabulary).keep_missing(monitor=monitor)
     return _report(vocabulary, default=False, revision=revision.number)
 
 
@@ -156,7 +155,7 @@ def use_vocabulary(
             message=f"vocabulary of {source.name}",
             configuration={"used": source.name},
         )
-        NodeWords.of_map(writable, vocabulary).keep_missing(_node_ids(writable), monitor)
+        NodeWords.of_map(writable, vocabulary).keep_missing(monitor=monitor)
     return _report(vocabulary, default=False, revision=revision.number)
 
 
@@ -175,10 +174,6 @@ def _read_vocabulary(source: Path) -> Vocabulary:
             f"{source} has no vocabulary of its own; train one with engram vocabulary train"
         )
     return decode_vocabulary(body)
-
-
-def _node_ids(store: Map) -> list[NodeId]:
-    return [node.id for node in store.load().nodes]
 
 
 def _report(

@@ -395,8 +395,7 @@ class Replay(ResultSink):
         """One for all segments, since indexing all nodes is slow."""
         name, descriptor = self._options.relocaliser_name, self._settings.frontend.descriptor
         centre = self._merge.centre
-        graph = self._merge.graph
-        return None if name is None else relocaliser_in(centre, name, descriptor, graph)
+        return None if name is None else relocaliser_in(centre, name, descriptor, self._merge.graph)
 
     def _localiser_of(
         self, session: Session, segment: Segment, relocaliser: Relocaliser | None
@@ -413,6 +412,7 @@ class Replay(ResultSink):
             relocaliser=relocaliser,
             live=session.id,
             saves=True,
+            graph=self._merge.graph,
             clock=session,
         )
         if session.id not in self._iterations:
