@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from engram.frontend.frame import BRIEF
 from engram.maps.map import Map
@@ -33,6 +34,7 @@ def test_a_city_is_a_sound_map_that_localises(tmp_path: Path) -> None:
     assert path.read_bytes() == before
 
 
+@pytest.mark.long
 def test_a_lost_robot_finds_the_same_places_by_stored_blocks(tmp_path: Path) -> None:
     city, path = City(4, length=450), tmp_path / "city.engram"
     city.write(path)

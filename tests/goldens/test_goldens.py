@@ -11,8 +11,10 @@ from tests.goldens.cases import DrivesMissingError, computed
 from tests.goldens.checking import differences
 from tests.goldens.results import Case, first_difference
 
+_REAL = pytest.param("kitti", marks=[pytest.mark.data, pytest.mark.long])
 
-@pytest.mark.parametrize("group", ["street", pytest.param("kitti", marks=pytest.mark.data)])
+
+@pytest.mark.parametrize("group", ["street", _REAL])
 def test_a_drive_gives_what_it_gave(group: str) -> None:
     try:
         with computed(group) as found:

@@ -59,15 +59,14 @@ def street_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.parametrize("mapped", [map_recorded, map_live])
 @pytest.mark.parametrize(
-    ("alone_m", "alike_m", "parts"),
+    ("mapped", "alone_m", "alike_m", "parts"),
     [
-        (120.0, 40.0, 2),  # alike for a while: nothing is joined
-        (120.0, 86.0, 1),  # the street itself
-        (110.0, 30.0, 2),
-        (60.0, 40.0, 1),  # a third of the way that it was alone
-        (20.0, 40.0, 1),
+        (map_recorded, 120.0, 40.0, 2),  # alike for a while: nothing is joined
+        (map_recorded, 120.0, 86.0, 1),  # the street itself
+        (map_live, 110.0, 30.0, 2),
+        (map_live, 60.0, 40.0, 1),  # a third of the way that it was alone
+        (map_recorded, 20.0, 40.0, 1),
     ],
 )
 def test_a_drive_that_hung_on_nothing_joins_where_fixes_agree_along_a_share_of_it(

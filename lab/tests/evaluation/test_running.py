@@ -105,6 +105,7 @@ def test_what_is_memoised_is_what_a_robot_would_do_unguided(plan: Plan) -> None:
     assert all(memo[key] == value for key, value in live.items())
 
 
+@pytest.mark.long
 def test_logs_of_one_name_in_several_folders_are_several_drives(
     campaign, plan: Plan, tmp_path: Path
 ) -> None:
@@ -196,6 +197,7 @@ def test_more_policies_later_cost_only_what_is_new(plan: Plan, tmp_path: Path) -
     assert all(path.read_bytes() == bytes_ for path, bytes_ in before.items())
 
 
+@pytest.mark.long
 def test_a_relocaliser_shares_maps_and_matches_but_not_results(
     campaign, plan: Plan, tmp_path: Path
 ) -> None:
@@ -212,6 +214,7 @@ def test_a_relocaliser_shares_maps_and_matches_but_not_results(
     assert set(results(other)) == set(before)
 
 
+@pytest.mark.long
 def test_policies_are_run_again_in_the_folds_that_are_run(plan: Plan, tmp_path: Path) -> None:
     work = tmp_path / plan.work.name
     shutil.copytree(plan.work, work)

@@ -59,7 +59,9 @@ def campaign(tmp_path_factory) -> DriveSet:
     return write_campaign(tmp_path_factory.mktemp("campaign"), LOOKS[:5])
 
 
-@pytest.fixture(scope="module", params=PAPERS)
+@pytest.fixture(
+    scope="module", params=[pytest.param(PAPERS[0], marks=pytest.mark.long), *PAPERS[1:]]
+)
 def plan(request, campaign, tmp_path_factory) -> Plan:
     plan = make_plan(campaign, paper(request.param), OPTIONS, tmp_path_factory.mktemp("work"))
     run(plan)
@@ -196,6 +198,7 @@ def test_what_is_in_force_stands_beside_every_table(plan: Plan, tmp_path: Path) 
     assert {row["setting"] for row in kept if row["differs"]} <= set(VARIED)
 
 
+@pytest.mark.long
 def test_what_the_study_sets_itself_is_told(campaign, tmp_path: Path) -> None:
     plan = make_plan(campaign, Settings(), OPTIONS, tmp_path / "work")
     run(plan)
@@ -304,7 +307,7 @@ def usual(campaign, tmp_path_factory) -> Plan:
     return plan
 
 
-@pytest.mark.parametrize("table", HELD_OUT)
+@pytest.mark.parametrize("table", [pytest.param("localiser", marks=pytest.mark.long), "gaps"])
 def test_a_held_out_drive_has_every_setting(usual: Plan, table: str) -> None:
     fold = usual.folds[0]
     drive = usual.drives.drives[fold.held_out[0]]
@@ -360,6 +363,7 @@ def given_to(monkeypatch, module, name: str) -> list[tuple[tuple, dict]]:
     return calls
 
 
+@pytest.mark.long
 def test_maps_have_every_setting(campaign, tmp_path: Path, monkeypatch) -> None:
     calls = given_to(monkeypatch, building, "map_drive")
     for key in of(*IN_MAPS):
@@ -532,6 +536,7 @@ def test_downloads_and_orders_of_a_fleet_have_every_setting(
             assert getattr(driving, name) == getattr(judge.localising, name) == value
 
 
+@pytest.mark.long
 def test_a_study_by_the_command_line_says_what_it_ran_by(engram, campaign, tmp_path: Path) -> None:
     logs = [one.path for one in campaign.drives]
     ran = engram(

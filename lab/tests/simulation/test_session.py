@@ -82,7 +82,8 @@ np.save(sys.argv[2], next(drive.frames(20, 21)).left)
 """
 
 
-@pytest.mark.parametrize("session", [pytest.param(0, marks=pytest.mark.long), 3])
+@pytest.mark.long
+@pytest.mark.parametrize("session", [0, 3])
 def test_every_instruction_set_gives_the_same_picture(
     session: int, hamlet: Campaign, tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Table, select
+from sqlalchemy import Connection, Table, func, select
 
 from engram import _core
 from engram.errors import MapCorruptError
 from engram.maps.rows import describe, mismatch
-from engram.maps.schema import hidden, nodes, revisions
+from engram.maps.schema import attempts, edges, hidden, nodes, path_entries, revisions
 from engram.maps.view import View, place_in_history, places_in_history
 
 _KINDS = {int: "i", float: "f", str: "s"}
@@ -127,10 +127,12 @@ class Visible:
     Attributes:
         places: of the visible revisions in the history, by key.
         hidden: keys of hidden rows, by name of the table.
+        until: largest key of the rows that are shown, by name of the table; of other tables all.
     """
 
     places: Mapping[int, int]
     hidden: Mapping[str, frozenset[int]]
+    until: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
     def of(connection: Connection, *views: View) -> list[Visible]:
@@ -160,9 +162,19 @@ class Visible:
                 found.setdefault(record, set()).add(target)
         return Visible(places, {name: frozenset(keys) for name, keys in found.items()})
 
+    def as_of_now(self, connection: Connection) -> Visible:
+        """Without what an open revision adds later to the tables of a graph."""
+        tables = (nodes, edges, path_entries, attempts)
+        newest = {
+            one.name: connection.execute(select(func.max(one.c.key))).scalar() or 0
+            for one in tables
+        }
+        return replace(self, until=newest)
+
     def has(self, table: Table, key: int, revision: int) -> bool:
         """Whether a row is visible, by itself."""
-        return revision in self.places and key not in self.hidden_of(table)
+        kept = key <= self.until.get(table.name, key) and key not in self.hidden_of(table)
+        return kept and revision in self.places
 
     def hidden_of(self, table: Table) -> frozenset[int]:
         """Keys of the table's hidden rows."""
@@ -173,6 +185,8 @@ class Visible:
         known, which = np.unique(rows["revision"], return_inverse=True)
         seen = np.array([key in self.places for key in known.tolist()], np.bool_)[which]
         key = table.primary_key.columns[0].name
+        if table.name in self.until:
+            seen &= rows[key] <= self.until[table.name]
         at_nodes = [(name, nodes) for name in ("a", "b", "node") if name in table.c]
         for name, target in ((key, table), *at_nodes):
             if gone := self.hidden_of(target):

@@ -17,7 +17,6 @@ from sqlalchemy import (
     Table,
     and_,
     bindparam,
-    func,
     literal_column,
     not_,
     select,
@@ -84,10 +83,11 @@ class MapPages:
             self.sessions: Sequence[SessionId] = [one.id for one in known.values()]
             self._session_numbers = {key: number for number, key in enumerate(known)}
             self._cameras: dict[int, CameraId] = {key: one.id for key, one in cameras.items()}
-            (self._visible,) = Visible.of(connection, view)
+            (visible,) = Visible.of(connection, view)
+            self._visible = visible.as_of_now(connection)
             path_rows = list(view.rows(connection, paths))
             self._removed = removed_measurements(view.rows(connection, removals))
-            newest = connection.execute(select(func.max(nodes.c.key))).scalar() or 0
+        newest = self._visible.until[nodes.name]
         if newest > _LARGEST_KEY:
             raise MapCorruptError(f"{database.name}: a node has the key {newest}; run engram check")
         self.end: int = newest

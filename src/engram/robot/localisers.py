@@ -74,7 +74,8 @@ def localiser_in(
     ranking = policy_named(policy) if isinstance(policy, str) else policy
     descriptor = settings.frontend.descriptor
     words = opened.derived(words_of, descriptor)
-    graph = parts.get("graph") or opened.read_graph()
+    graph = parts.get("graph")
+    graph = opened.read_graph() if graph is None else graph  # one without nodes is not true
     learn = _by_pages if isinstance(graph, PagedGraph) else _whole
     known = learn(opened, graph, camera.fx, settings.localiser)
     background = Background(opened.derived(drives_of), known.lessons, words, opened.cameras)
