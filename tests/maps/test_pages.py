@@ -11,6 +11,7 @@ import pytest
 
 from engram.frontend.frame import BRIEF
 from engram.geometry.se3 import SE3
+from engram.graph.basin import MatchBasin
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
     Edge,
@@ -29,7 +30,8 @@ from engram.localiser.settings import LocaliserConfig
 from engram.maps.map import Map
 from engram.maps.map_frame import moves
 from engram.maps.writer import RevisionWriter
-from engram.robot.localisers import _by_pages, _whole
+from engram.ranking.lessons import Lessons
+from engram.robot.localisers import lessons_of
 
 from .frames import CAMERA, FRONTEND, frame
 from .maps import assert_same_edges, attempt, node, session
@@ -198,17 +200,19 @@ def test_hidden_nodes_are_not_there(town: Path) -> None:
 
 
 def test_lessons_basin_and_paths_are_the_same(opened: Map) -> None:
-    paged, whole = opened.read_graph(), opened.graph
-    ours = _by_pages(opened, paged, CAMERA.fx, LocaliserConfig())
-    theirs = _whole(opened, whole, CAMERA.fx, LocaliserConfig())
-    np.testing.assert_array_equal(ours.basin.rates, theirs.basin.rates)
+    paged, whole, config = opened.read_graph(), opened.graph, LocaliserConfig()
+    basin, lessons = lessons_of(opened, CAMERA.fx, config.basin, config.lessons)
+    counted = MatchBasin.of(CAMERA.fx, opened.basin_counts, config.basin)
+    np.testing.assert_array_equal(basin.rates, counted.rates)
+    made, viewers = opened.attempts, [path_id(one) for one in opened.sessions]
+    rates = counted.success_rate(made.along_m.astype(np.float64), made.across_m.astype(np.float64))
+    learnt = Lessons.learnt(whole, opened.path_memory, viewers, made, rates, config.lessons)
     numbers = np.arange(len(whole), dtype=np.int32)
     nodes = np.array([paged.index(one.id) for one in whole.nodes], np.int32)
-    np.testing.assert_array_equal(
-        ours.lessons.log_odds_of(nodes), theirs.lessons.log_odds_of(numbers)
-    )
+    np.testing.assert_array_equal(lessons.log_odds_of(nodes), learnt.log_odds_of(numbers))
+    all_paths = PathMemory(paged, pages=opened.pages)
     for kinds in ({PathEntryKind.MATCHED}, set(PathEntryKind)):
-        paths, known = ours.paths.counting(kinds), theirs.paths.counting(kinds)
+        paths, known = all_paths.counting(kinds), opened.path_memory.counting(kinds)
         for some in (slice(0, 70), slice(-90, None)):
             np.testing.assert_array_equal(
                 paths.co_occurrence(nodes[some], nodes), known.co_occurrence(numbers[some], numbers)

@@ -7,7 +7,7 @@ the nodes of a page were saved one after another.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,7 @@ from sqlalchemy import (
 
 from engram.errors import MapCorruptError
 from engram.geometry.cameras import CameraId
-from engram.graph.basin import MatchBasin
+from engram.graph.basin import BasinCounts, MatchBasin
 from engram.graph.graph import EDGE_KINDS
 from engram.graph.model import EdgeKind, NodeId, PathEntryKind, PathId, SessionId
 from engram.graph.pages import PAGE, GraphPage
@@ -33,6 +33,7 @@ from engram.graph.paths import ENTRY_KINDS, Attempts, Evidence
 from engram.maps.attempts import PAGE as ATTEMPT_PAGE
 from engram.maps.attempts import page_of, unpack
 from engram.maps.columns import Columns, Visible, read_columns
+from engram.maps.counting import count_open, totals_of
 from engram.maps.marks import removed_measurements, without_removed
 from engram.maps.reading import load_cameras, sessions_by_key
 from engram.maps.rows import (
@@ -53,10 +54,9 @@ from engram.maps.schema import (
     paths,
     removals,
     revisions,
-    sessions,
 )
 from engram.maps.sqlite import SqliteDatabase, reading_rows
-from engram.maps.totals import count_all, own_rows, state_at_head
+from engram.maps.totals import count_all, own_rows
 from engram.maps.view import View, head
 
 # Dense indices are of 32 bits; what a process adds follows after those of the map.
@@ -147,26 +147,11 @@ class MapPages:
 
     @cached_property
     def _runs(self) -> Runs:
-        """The runs of all visible nodes; components without the edges of an open revision."""
-        view = self._view
+        """The runs of all visible nodes."""
         with self._database.reading() as connection:
-            found = None
-            if view.at == head(connection):
-                _, found = state_at_head(connection, view.at)
-            if found is None:
-                found = count_all(connection, View(view.at))[1]
-            own = select(sessions.c.key).where(sessions.c.revision == view.own)
-            written = select(nodes.c.key).where(
-                nodes.c.session.in_(own), nodes.c.revision == view.own
-            )
-            keys = np.array(sorted(connection.execute(written).scalars()), np.int64)
-            if not len(keys):
-                return found
-            ends = {"first": int(keys[0]), "last": int(keys[-1])}
-            steps = [tuple(row) for row in connection.execute(_OWN_STEPS, ends | {"own": view.own})]
-        chained = np.array(steps, np.int64).reshape(-1, 2)
-        chained = chained[np.isin(chained, keys).all(axis=1)]
-        return found.with_nodes(keys).joined(chained, chained)
+            if self._view.own is None and self._view.at < head(connection):
+                return count_all(connection, self._view)[1]
+            return count_open(connection, self._view)[1]
 
     def unused(self, end: int) -> Iterator[int]:
         """See `GraphPages`; asks for the ranges of revisions, and for keys where they have gaps."""
@@ -226,6 +211,12 @@ class MapPages:
                 np.array(numbers, np.int32),
                 np.array(kinds, np.uint8)[codes],
             )
+
+    @cached_property
+    def basin_counts(self) -> BasinCounts:
+        """Counts of the attempts of all drives, from which match basins are learnt."""
+        with self._database.reading() as connection:
+            return totals_of(connection, self._view).basin_counts
 
     def evidence(self, basin: MatchBasin) -> Callable[[int, int], Evidence]:
         """How past drives fared with the nodes from a dense index up to another one.
@@ -375,11 +366,6 @@ _IDS = select(nodes.c.key, nodes.c.revision, nodes.c.uuid).where(nodes.c.key.bet
 _STEPS = select(*edges.columns).where(
     edges.c.a.between(_FIRST, _LAST),
     edges.c.b.between(_FIRST, _LAST),
-    edges.c.kind == literal_column(f"'{EdgeKind.ODOMETRY}'"),
-)
-_OWN_STEPS = select(edges.c.a, edges.c.b).where(
-    edges.c.a.between(_FIRST, _LAST),
-    edges.c.revision == bindparam("own"),
     edges.c.kind == literal_column(f"'{EdgeKind.ODOMETRY}'"),
 )
 _OF_SESSION = select(*attempts.columns).where(attempts.c.session == bindparam("session"))

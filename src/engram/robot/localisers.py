@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TypeAlias, TypedDict, Unpack
-
-import numpy as np
 
 from engram.errors import InputError, SequenceError
 from engram.frontend.frame import DescriptorKind
@@ -14,19 +11,17 @@ from engram.geometry.cameras import StereoCamera
 from engram.graph.basin import BasinConfig, MatchBasin
 from engram.graph.clock import Clocked
 from engram.graph.graph import ExperienceGraph
-from engram.graph.model import Session, SessionId, path_id
+from engram.graph.model import Session, SessionId
 from engram.graph.neighbourhood import Neighbourhood
-from engram.graph.pages import PagedGraph
-from engram.graph.paths import Evidence, PathMemory
+from engram.graph.paths import PathMemory
 from engram.localiser.attempts import Matcher
 from engram.localiser.localisation import Budget
 from engram.localiser.localiser import UNNAMED_LIVE_SESSION, LiveDrive, Localiser, MapParts
 from engram.localiser.relocalisation import Relocaliser, relocaliser_named
-from engram.localiser.settings import LocaliserConfig
 from engram.maps.map import Map
 from engram.places.words import words_of
 from engram.ranking.context import Background, RankingPolicy, uses_words
-from engram.ranking.lessons import Lessons, PagedLessons
+from engram.ranking.lessons import LessonsConfig, PagedLessons
 from engram.ranking.policies import policy_named
 from engram.robot.settings import Settings
 from engram.sequences.framelog.reader import FrameLog
@@ -41,8 +36,9 @@ class LocaliserParts(TypedDict, total=False):
         budget: attempts per frame; None for 2 lanes × 2 rounds.
         relocaliser: one of `relocaliser_names()`, or one that several drives share; None for none.
         saves: whether the session is being mapped.
-        graph: the graph in which it localises, and which grows where it maps; None for one of its
-            own by pages. Of `Map.graph` paths, lessons and attempts are read whole.
+        graph: the graph in which it localises, of the map's pages, and which grows where it maps;
+            None for one of its own.
+        paths: the paths of that graph; None for those of the map.
         threads: how many threads the lanes share; None for one each.
         matcher, search: replace the default ones; see `Localiser` and `MapParts`.
         clock: time zone and location of its stamps; None if unknown.
@@ -57,6 +53,7 @@ class LocaliserParts(TypedDict, total=False):
     threads: int | None
     search: Callable[..., Neighbourhood] | None
     graph: ExperienceGraph | None
+    paths: PathMemory | None
     clock: Clocked | None
 
 
@@ -76,15 +73,23 @@ def localiser_in(
     words = opened.derived(words_of, descriptor)
     graph = parts.get("graph")
     graph = opened.read_graph() if graph is None else graph  # one without nodes is not true
-    learn = _by_pages if isinstance(graph, PagedGraph) else _whole
-    known = learn(opened, graph, camera.fx, settings.localiser)
-    background = Background(opened.derived(drives_of), known.lessons, words, opened.cameras)
+    paths = parts.get("paths")
+    paths = PathMemory(graph, pages=opened.pages) if paths is None else paths
+    config = settings.localiser
+    basin, lessons = opened.derived(lessons_of, camera.fx, config.basin, config.lessons)
+    background = Background(opened.derived(drives_of), lessons, words, opened.cameras)
     if uses_words(ranking):
         words.prepare()
     return Localiser(
-        MapParts(graph, known.paths, opened.frames, background, parts.get("search")),
+        MapParts(
+            graph,
+            paths.counting(config.path_entries.kinds),
+            opened.frames,
+            background,
+            parts.get("search"),
+        ),
         LiveDrive(
-            known.basin,
+            basin,
             parts.get("live", UNNAMED_LIVE_SESSION),
             parts.get("saves", False),
             parts.get("clock"),
@@ -94,7 +99,7 @@ def localiser_in(
         relocaliser=relocaliser_in(opened, relocaliser, descriptor, graph)
         if isinstance(relocaliser, str)
         else relocaliser,
-        config=settings.localiser,
+        config=config,
         matcher=parts.get("matcher"),
         threads=parts.get("threads"),
     )
@@ -122,47 +127,13 @@ def drives_of(opened: Map) -> dict[SessionId, Session]:
     return dict(opened.sessions)
 
 
-def lessons_of(opened: Map, focal_px: float, config: LocaliserConfig) -> Lessons:
-    """`Lessons` of a map, for a live camera of this focal length, px; for `Map.derived`."""
-    made, basin = opened.attempts, MatchBasin.of(focal_px, opened.basin_counts, config.basin)
-    along_m, across_m = (x.astype(np.float64) for x in (made.along_m, made.across_m))
-    rates = basin.success_rate(along_m, across_m)
-    viewers = [path_id(session) for session in opened.sessions]
-    return Lessons.learnt(opened.graph, opened.path_memory, viewers, made, rates, config.lessons)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Known:
-    """What a localiser reads of paths and attempts."""
-
-    paths: PathMemory
-    lessons: Lessons | PagedLessons
-    basin: MatchBasin
-
-
-def _by_pages(
-    opened: Map, graph: ExperienceGraph, focal_px: float, config: LocaliserConfig
-) -> _Known:
+def lessons_of(
+    opened: Map, focal_px: float, basin_config: BasinConfig, config: LessonsConfig
+) -> tuple[MatchBasin, PagedLessons]:
+    """What past drives teach a live camera of this focal length, px; for `Map.derived`."""
     pages = opened.pages
-    basin, evidence = opened.derived(_past_drives, focal_px, config.basin)
-    paths = PathMemory(graph, config.path_entries.kinds, pages)
-    return _Known(paths, PagedLessons(evidence, pages.end, config.lessons), basin)
-
-
-def _past_drives(
-    opened: Map, focal_px: float, config: BasinConfig
-) -> tuple[MatchBasin, Callable[[int, int], Evidence]]:
-    basin = MatchBasin.of(focal_px, opened.totals().basin_counts, config)
-    return basin, opened.pages.evidence(basin)
-
-
-def _whole(opened: Map, graph: ExperienceGraph, focal_px: float, config: LocaliserConfig) -> _Known:
-    assert graph is opened.graph
-    return _Known(
-        opened.path_memory.counting(config.path_entries.kinds),
-        opened.derived(lessons_of, focal_px, config),
-        MatchBasin.of(focal_px, opened.basin_counts, config.basin),
-    )
+    basin = MatchBasin.of(focal_px, pages.basin_counts, basin_config)
+    return basin, PagedLessons(pages.evidence(basin), pages.end, config)
 
 
 DriveSequence: TypeAlias = StereoSequence | FrameLog

@@ -34,13 +34,12 @@ from engram.graph.model import (
     Session,
     SessionId,
 )
-from engram.graph.paths import Attempts
+from engram.graph.paths import Attempts, PathMemory
 from engram.localiser.localisation import Position
 from engram.maps.map import Map
 from engram.maps.records import StoredNode
 from engram.maps.writer import RevisionWriter
 from engram.robot.anchors import had_goal
-from engram.robot.localisers import graph_in
 
 if TYPE_CHECKING:
     from scipy.cluster.hierarchy import DisjointSet
@@ -120,7 +119,7 @@ class Merge:
     Each addition goes into the fleet map's graph and path memory, the open revision and the report.
 
     Attributes:
-        centre: the fleet map; its graph and path memory grow.
+        centre: the fleet map.
         held: those of the robot's nodes that the fleet map had before.
         runs: which nodes of the fleet map were connected before.
         robot: the robot's map.
@@ -157,7 +156,12 @@ class Merge:
     @cached_property
     def graph(self) -> ExperienceGraph:
         """The fleet map's, in which segments are replayed; it grows."""
-        return graph_in(self.centre, saves=True)
+        return self.centre.read_graph()
+
+    @cached_property
+    def paths(self) -> PathMemory:
+        """The fleet map's paths; they grow."""
+        return PathMemory(self.graph, pages=self.centre.pages)
 
     # -- known records
 
@@ -344,7 +348,7 @@ class Merge:
     def _add_entry(self, new: PathEntry | None) -> None:
         if new is not None:
             self._known_entries(new.path).add(new)
-            self.centre.path_memory.add(new)
+            self.paths.add(new)
             self.writer.add_path_entry(new)
             self.report.path_entries += 1
 

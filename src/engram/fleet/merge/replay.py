@@ -413,6 +413,7 @@ class Replay(ResultSink):
             live=session.id,
             saves=True,
             graph=self._merge.graph,
+            paths=self._merge.paths,
             clock=session,
         )
         if session.id not in self._iterations:
