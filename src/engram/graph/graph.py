@@ -621,7 +621,7 @@ class ExperienceGraph:
         return all(one == session for one in self._sessions)
 
     def driven_m_of(self, nodes: NDArray[np.int32]) -> NDArray[np.float64]:
-        """(Y,) float64: `driven_m` of nodes, given by (Y,) int32 dense indices."""
+        """(Y,) float64: `driven_m` of nodes, metres, by (Y,) int32 dense indices."""
         self._want(nodes)
         return self._driven_m.rows.take(nodes)
 
