@@ -23,6 +23,7 @@ from engram.errors import (
     MapError,
     MapLockedError,
     NotAMapError,
+    RevisionError,
     StorageFullError,
 )
 from engram.graph.model import path_id
@@ -349,6 +350,49 @@ class TestCheckNamesTableUuidAndFact:
         content[page * page_bytes - 5] ^= 1
         broken.write_bytes(content)
         assert any(fact.startswith("file: ") for fact in problems(broken))
+
+
+class TestCheckSinceARevision:
+    def test_only_later_rows_are_read(self, broken, sound):
+        whole, later = check_file(broken), check_file(broken, since=1)
+        assert later.problems == ()
+        assert later.rows < whole.rows
+        assert check_file(broken, since="head~1") == later
+        assert check_file(broken, since=2).rows < later.rows
+        node = sound[1][0].nodes[1].id
+        change(broken, "UPDATE frames SET landmarks = x'00' WHERE node = 2")
+        assert check_file(broken, since=1).problems == ()
+        (fact,) = check_file(broken, since=0).problems[:1]
+        assert str(fact) == f"frames {node}: does not match its checksum"
+
+    @pytest.mark.parametrize(
+        ("statement", "fact"),
+        [
+            ("UPDATE frames SET landmarks = x'00' WHERE node = 5", "does not match its checksum"),
+            ("UPDATE nodes SET stamp_ns = 0 WHERE key = 5", "does not match its checksum"),
+            ("DELETE FROM edges WHERE key = 4", "revision 2 added 2 rows, but 1 are stored"),
+            ("DELETE FROM frames WHERE node = 6", "its frame is missing"),
+            ("DELETE FROM sessions WHERE key = 2", "its session (row 2 of sessions) is missing"),
+            ("DELETE FROM revisions WHERE key = 1", "is number 1 of the history"),
+        ],
+    )
+    def test_damage_in_later_rows_is_found(self, broken, statement, fact):
+        change(broken, statement)
+        assert any(fact in str(one) for one in check_file(broken, since=1).problems)
+
+    def test_later_rows_are_those_that_were_hashed(self, broken):
+        with sqlite3.connect(broken) as connection:
+            connection.row_factory = sqlite3.Row
+            row = dict(connection.execute("SELECT * FROM nodes WHERE key = 5").fetchone())
+        connection.close()
+        change(broken, "DELETE FROM nodes WHERE key = 5")
+        insert_row(broken, nodes, {**row, "driven_m": 99.0})
+        (problem,) = check_file(broken, since=1).problems
+        assert "revision 2: its rows have the content hash" in problem.fact
+
+    def test_a_revision_that_is_not_there_is_refused(self, broken):
+        with pytest.raises(RevisionError, match="1 to 2"):
+            check_file(broken, since=3)
 
 
 def in_a_child_without_rights(work: Callable[[], list[str]]) -> list[str]:

@@ -119,6 +119,10 @@ def plot(
 def check(
     map_path: options.MapPath,
     *,
+    since: Annotated[
+        str | None,
+        typer.Option("--since", metavar="REV", help="Verify only the revisions after this one."),
+    ] = None,
     clean: Annotated[
         bool, typer.Option("--clean", help="Remove rows that abandoned revisions left behind.")
     ] = False,
@@ -146,13 +150,14 @@ def check(
 ) -> None:
     """Verify a map.
 
-    Checks every record against its hash, and every edge and path against its nodes. The exit status
-    is 1 if anything is wrong. --geometry looks for wrong edges instead. A repair is a revision that
-    engram revert can undo.
+    Checks every record against its hash, and every edge and path against its nodes; with --since
+    those of later revisions. The exit status is 1 if anything is wrong. --geometry looks for wrong
+    edges instead. A repair is a revision that engram revert can undo.
 
     \b
     Examples:
       engram check town.engram
+      engram check town.engram --since head~2
       engram check town.engram --geometry --pictures suspects
       engram check town.engram --geometry --repair --yes
       engram check town.engram --seal
@@ -169,7 +174,7 @@ def check(
             raise typer.Exit(1)
         return
     sealed = seal_map(map_path) if seal else []
-    report = check_map(map_path, clean=clean)
+    report = check_map(map_path, clean=clean, since=since)
     found = {**report, "sealed": sealed} if seal else report
     options.show(found, partial(_checked_text, report, sealed if seal else None), as_json=as_json)
     if report["problems"]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 from uuid import UUID
 
 import numpy as np
-from sqlalchemy import Table, select
+from numpy.typing import NDArray
+from sqlalchemy import Select, Table, select
 
 from engram.errors import EngramError, MapCorruptError
 from engram.frontend.blobs import (
@@ -22,18 +24,21 @@ from engram.frontend.blobs import (
 from engram.frontend.features import feature_kind
 from engram.frontend.frame import DescriptorKind, FrameStatus
 from engram.geometry.cameras import StereoCamera
-from engram.graph.model import NodeId, PathEntryKind, SessionId
+from engram.graph.model import EdgeKind, NodeId, PathEntryKind, SessionId
 from engram.maps.attempts import decode_words, page_of, unpack
+from engram.maps.columns import Columns
 from engram.maps.content import verified_hash
 from engram.maps.marks import goal_from_row, removal_from_row
 from engram.maps.place_blocks import problem_of
 from engram.maps.records import CheckReport, Problem
+from engram.maps.revisions import sessions_of
 from engram.maps.rows import (
     Row,
     amendment_from_row,
     camera_from_row,
     check_tally,
     describe,
+    edge_arrays,
     edges_from_rows,
     from_json,
     session_from_row,
@@ -41,7 +46,7 @@ from engram.maps.rows import (
     uuid_from_bytes,
     verified,
 )
-from engram.maps.runs import load_runs
+from engram.maps.runs import Keys, load_runs
 from engram.maps.schema import (
     FORMAT_VERSION,
     VERSIONED,
@@ -74,7 +79,7 @@ from engram.maps.schema import (
 )
 from engram.maps.sqlite import SqliteDatabase
 from engram.maps.totals import count_all, own_rows, totals_at
-from engram.maps.view import LARGEST_KEY, View, head
+from engram.maps.view import LARGEST_KEY, View, few, head
 
 # The table that a column refers to.
 _REFERENCES = {
@@ -100,24 +105,39 @@ _ORDER = (
 )
 assert set(_ORDER) == set(metadata.sorted_tables)
 
+_DERIVED = {words, place_blocks, runs}
+_HIDEABLE = {*VERSIONED} - {hidden}
+_SIZES = {"uuid": 16, "landmark_hash": 16, "a_from_b": 96, "covariance": 168, "map_from_node": 96}
+# Rows of the largest tables that are read at once, and of those with large bodies.
+_MOST = 10_000
+_AT_ONCE = {frames: 20, attempts: 10, vocabularies: 1, place_blocks: 1}
+_NONE = np.zeros(0, np.int64)
+
 # Rounding of rotations that come from chains of products.
 _ROTATION_TOLERANCE = 1e-6
 _NOBODY = NodeId(UUID(int=0))
 _NO_SESSION = SessionId(UUID(int=0))
 
 
-def check(database: SqliteDatabase, *, thin: bool = False) -> CheckReport:
+def check(database: SqliteDatabase, *, thin: bool = False, since: int | None = None) -> CheckReport:
     """Verifies the file's structure, every row, every blob and every reference.
+
+    Rows are read in parts, and those that they refer to are looked up: memory does not grow with
+    the map, but by 16 bytes a node.
 
     Args:
         database: of the map.
         thin: whether frames of nodes may be missing, as in a hand-in.
+        since: only later revisions are verified: their rows and what
+            they refer to, without the structure of the file; None for everything.
     """
-    checking = _Checking(database, thin)
-    for fact in database.integrity_problems():
-        checking.report(None, "", fact)
+    checking = _Checking(database, thin, since)
+    if since is None:
+        for fact in database.integrity_problems():
+            checking.report(None, "", fact)
     for table in _ORDER:
-        checking.check_table(table)
+        if since is None or table not in _DERIVED:
+            checking.check_table(table)
     checking.check_whole()
     return checking.result()
 
@@ -128,83 +148,160 @@ class _Checking:
 
     database: SqliteDatabase
     thin: bool = False
+    since: int | None = None
     problems: list[Problem] = field(default_factory=list)
     rows: int = 0
     blobs: int = 0
-    # The revision of each sound row, by table and key.
-    revision_of: dict[Table, dict[int, int]] = field(default_factory=dict)
     revision_rows: dict[int, Row] = field(default_factory=dict)
     cameras: dict[int, StereoCamera] = field(default_factory=dict)
     kinds: dict[int, DescriptorKind] = field(default_factory=dict)
-    # The hash of landmarks and the keys of camera and front-end of each node.
-    landmark_hashes: dict[int, tuple[bytes, int, int]] = field(default_factory=dict)
-    uuids: dict[tuple[Table, int], str] = field(default_factory=dict)
+    # Sound rows to which those of the part that is being checked refer, by table and key.
+    known: dict[Table, dict[int, Row]] = field(default_factory=lambda: defaultdict(dict))
+    # Keys of sound rows, part by part.
+    held: dict[Table, list[Keys]] = field(
+        default_factory=lambda: {nodes: [], frames: [], map_format: []}
+    )
+    # Number of sound rows (of attempts, of those in them), first and last key, by revision.
     brought: Counter[tuple[int, str]] = field(default_factory=Counter)
-    # First and last key of the rows of each revision, by table.
+    stored: Counter[int] = field(default_factory=Counter)
     ranges: dict[tuple[int, str], tuple[int, int]] = field(default_factory=dict)
-    session_ids: dict[int, SessionId] = field(default_factory=dict)
-    # Sessions that an open revision shows again, with that revision.
-    shown_again: dict[int, int] = field(default_factory=dict)
 
     def report(self, table: Table | None, record: str, fact: str) -> None:
         self.problems.append(Problem("file" if table is None else table.name, record, fact))
 
     def check_table(self, table: Table) -> None:
         """Checks each row by itself, then its references."""
-        self.revision_of[table] = {}
-        check_row = _ROW_CHECKS.get(table)
-        for row in self._sound_rows(table):
-            name = self._name(table, list(row.values()))
-            key = next(iter(row.values()))
-            self.revision_of[table][key] = row.get("revision", 0)
-            if not 0 <= key <= LARGEST_KEY:
-                self.report(table, name, f"its key {key} leaves no room for others")
-            if "uuid" in row:
-                self.uuids[table, key] = name
-            if "revision" in row:
-                self._count(table, row)
-                self._check_references(table, row, name)
-            if check_row is not None:
-                try:
-                    check_row(self, row)
-                except (EngramError, ValueError) as error:
-                    self.report(table, name, str(error))
-
-    def _sound_rows(self, table: Table) -> Iterator[Row]:
-        """Rows that match their checksums; the others are reported."""
-        query = select(table).order_by(*table.primary_key.columns)
         try:
-            with self.database.reading() as connection:
-                for values in connection.execute(query.execution_options(yield_per=100)):
-                    self.rows += 1
-                    try:
-                        yield from verified(table, [values])
-                    except MapCorruptError:
-                        self.report(table, self._name(table, values), "does not match its checksum")
+            for part in self._parts(table):
+                self.rows += len(part)
+                self.known.clear()
+                if table not in _CHECKS_OF_COLUMNS or not self._are_sound(table, part):
+                    self._check_rows(table, part)
         except MapCorruptError as error:
             self.report(table, "", str(error))
+
+    def _parts(self, table: Table) -> Iterator[list[tuple[Any, ...]]]:
+        """The rows of a table, so many at once."""
+        most = _AT_ONCE.get(table, _MOST if table in _CHECKS_OF_COLUMNS else 100)
+        with self.database.reading() as connection:
+            for query in self._queries(table):
+                ordered = query.order_by(*table.primary_key.columns)
+                found = connection.execute(ordered.execution_options(yield_per=most))
+                for part in found.partitions():
+                    yield list(map(tuple, part))
+
+    def _queries(self, table: Table) -> Iterator[Select[Any]]:
+        """The rows that are to be checked."""
+        if self.since is None or table not in VERSIONED:
+            yield select(table)
+            return
+        for row in self.revision_rows.values():
+            if row["number"] is None or row["number"] > self.since:
+                with suppress(MapCorruptError):  # reported with the history
+                    yield select(table).where(own_rows(row).rows(table))
+
+    def _are_sound(self, table: Table, part: list[tuple[Any, ...]]) -> bool:
+        """Whether all these rows and their references are sound, without saying which is not."""
+        try:
+            found = Columns.verified(table, part, _SIZES)
+            if not _CHECKS_OF_COLUMNS[table](found):
+                return False
+        except MapCorruptError:
+            return False
+        key, owners = found["key"], found["revision"].tolist()
+        if not ((key >= 0) & (key <= LARGEST_KEY)).all() or {*owners} - self.revision_rows.keys():
+            return False
+        for column in _REFERENCES.keys() & found.values.keys():
+            values = found[column].tolist()
+            self._learn(_REFERENCES[column], values)
+            for owner, value in {*zip(owners, values, strict=True)}:
+                revision = self.revision_rows[owner]
+                if self.reference_problem(revision, _REFERENCES[column], value):
+                    return False
+        for owner in {*owners}:
+            own = key[found["revision"] == owner]
+            self._count(table, owner, own, len(own))
+        if table in self.held:
+            self.held[table].append(key)
+        return True
+
+    def _check_rows(self, table: Table, part: list[tuple[Any, ...]]) -> None:
+        names = [column.name for column in table.columns]
+        for column in _REFERENCES.keys() & set(names):
+            self._learn(_REFERENCES[column], [values[names.index(column)] for values in part])
+        for values in part:
+            try:
+                (row,) = verified(table, [values])
+            except MapCorruptError:
+                self.report(table, self._name(table, values), "does not match its checksum")
+                continue
+            self._check_row(table, row, self._name(table, values))
+
+    def _check_row(self, table: Table, row: Row, name: str) -> None:
+        key = next(iter(row.values()))
+        if not 0 <= key <= LARGEST_KEY:
+            self.report(table, name, f"its key {key} leaves no room for others")
+        if table in self.held:
+            self.held[table].append(np.array([key]))
+        if "revision" in row:
+            amount = row["count"] if table is attempts else 1
+            self._count(table, row["revision"], np.array([key]), amount)
+            self._check_references(table, row, name)
+        if table in _ROW_CHECKS:
+            try:
+                _ROW_CHECKS[table](self, row)
+            except (EngramError, ValueError) as error:
+                self.report(table, name, str(error))
+
+    def _count(self, table: Table, revision: int, keys: Keys, amount: int) -> None:
+        """Counts sound rows of a revision, whose keys come in ascending order."""
+        self.brought[revision, table.name] += amount
+        self.stored[revision] += len(keys)
+        first, last = int(keys[0]), int(keys[-1])
+        self.ranges[revision, table.name] = (
+            self.ranges.get((revision, table.name), (first, last))[0],
+            last,
+        )
+
+    def _learn(self, table: Table, keys: Iterable[Any]) -> None:
+        """Looks up rows, for as long as the same part is checked; unsound ones count as missing."""
+        known = self.known[table]
+        wanted = {key for key in keys if isinstance(key, int)} - known.keys()
+        for part in few(sorted(wanted)):
+            for values in self._rows_of(table, part):
+                with suppress(MapCorruptError):
+                    (row,) = verified(table, [values])
+                    known[values[0]] = row
+
+    def _rows_of(self, table: Table, keys: Sequence[int]) -> list[tuple[Any, ...]]:
+        key = table.primary_key.columns[0]
+        query = select(table).where(key.in_(keys)).order_by(key)
+        try:
+            with self.database.reading() as connection:
+                return list(map(tuple, connection.execute(query)))
+        except MapCorruptError:  # reported when the table is read
+            return [row for one in keys for row in self._rows_of(table, [one]) if len(keys) > 1]
+
+    def _named(self, table: Table, key: int, otherwise: str) -> str:
+        """The UUID of a row; other words if there is no sound one."""
+        self._learn(table, [key])
+        row = self.known[table].get(key)
+        return otherwise if row is None else describe(table, list(row.values()))
 
     def _name(self, table: Table, values: Sequence[Any]) -> str:
         """Name of a row in messages, by UUID if possible."""
         row = dict(zip(table.columns.keys(), values, strict=False))
         if table in {frames, words}:
-            return self.uuids.get((nodes, row["node"]), f"of node row {row['node']}")
+            return self._named(nodes, row["node"], f"of node row {row['node']}")
         if table is edges:
-            ends = [self.uuids.get((nodes, row[end]), f"row {row[end]}") for end in ("a", "b")]
+            ends = [self._named(nodes, row[end], f"row {row[end]}") for end in ("a", "b")]
             return f"{ends[0]} → {ends[1]} ({row['kind']})"
         if table is path_entries:
-            return f"{self.uuids.get((paths, row['path']), row['path'])} #{row['sequence']}"
+            return f"{self._named(paths, row['path'], str(row['path']))} #{row['sequence']}"
         if table is attempts:
-            session = self.uuids.get((sessions, row["session"]), f"row {row['session']}")
-            return f"of session {session}"
+            key = row["session"]
+            return f"of session {self._named(sessions, key, f'row {key}')}"
         return describe(table, values)
-
-    def _count(self, table: Table, row: Row) -> None:
-        amount = row["count"] if table is attempts else 1
-        named = row["revision"], table.name
-        self.brought[named] += amount
-        key = next(iter(row.values()))  # they come in this order
-        self.ranges[named] = self.ranges.get(named, (key, key))[0], key
 
     def _check_references(self, table: Table, row: Row, name: str) -> None:
         revision = self.revision_rows.get(row["revision"])
@@ -218,40 +315,42 @@ class _Checking:
                     self.report(table, name, f"its {column} {fact}")
 
     def reference_problem(self, revision: Row, target: Table, key: int) -> str:
-        """The fault of a reference from a row of `revision`; "" if it is valid."""
-        known = self.revision_of[target]
-        name = self.uuids.get((target, key), f"row {key}")
-        if key not in known:
-            return f"({name} of {target.name}) is missing"
+        """The fault of a reference from a row of `revision` to a row that was looked up, or ""."""
+        row = self.known[target].get(key)
+        if row is None:
+            return f"(row {key} of {target.name}) is missing"
         if target in {cameras, frontends} or revision["status"] == "abandoned":
             return ""
-        other = self.revision_rows.get(known[key])
+        other = self.revision_rows.get(row["revision"])
         if other is None or other["key"] == revision["key"]:
             return ""
         if other["status"] != "committed" or (
             revision["status"] == "committed" and other["number"] > revision["number"]
         ):
+            name = describe(target, list(row.values()))
             return f"({name} of {target.name}) is of a revision that is not before its own"
         return ""
 
     def check_whole(self) -> None:
         """Checks that involve several rows."""
-        lacking = self.revision_of[nodes].keys() - self.revision_of[frames].keys()
-        for key in () if self.thin else lacking:
-            self.report(nodes, self.uuids[nodes, key], "its frame is missing")
+        held, shown = (np.concatenate([_NONE, *self.held[one]]) for one in (nodes, frames))
+        for key in () if self.thin else np.setdiff1d(held, shown).tolist():
+            self.report(nodes, self._named(nodes, key, f"row {key}"), "its frame is missing")
         self._check_history()
-        if len(self.revision_of[map_format]) != 1:
+        if len(self.held[map_format]) != 1:
             self.report(map_format, "", "must have one row")
         self._check_tally()
         if not self.problems:
             self._check_sums()
 
     def _check_sums(self) -> None:
-        """Works out again what a map stores of all its rows."""
+        """Works out again what a map stores of its rows: of all, or of those that are checked."""
         try:
             with self.database.reading() as connection:
                 newest = head(connection)
-                verified_hash(connection, newest)
+                verified_hash(connection, newest, self.since or 0)
+                if self.since is not None:
+                    return
                 totals, known = count_all(connection, View(newest))
                 if not totals.agrees(totals_at(connection, newest)):
                     self.report(revisions, str(newest), "its totals are not those of the rows")
@@ -271,57 +370,57 @@ class _Checking:
         committed = [row for row in self.revision_rows.values() if row["status"] == "committed"]
         committed.sort(key=lambda row: row["number"] or 0)
         for number, row in enumerate(committed, start=1):
-            name = str(row["number"])
             if (row["number"], row["parent"] or 0) != (number, number - 1):
                 self.report(
                     revisions,
-                    name,
+                    str(row["number"]),
                     f"is number {number} of the history, with parent {row['parent']}",
                 )
-            try:
-                contents = from_json(row["contents"], f"revision {name}")
-                ranges = own_rows(row).ranges
-            except MapCorruptError as error:
-                self.report(revisions, name, str(error))
-                continue
-            for table in (one for one in VERSIONED if not (self.thin and one is frames)):
-                found = self.brought[row["key"], table.name]
-                brought = contents.get(table.name, 0)
-                if brought != found:
-                    self.report(
-                        table, "", f"revision {name} added {brought} rows, but {found} are stored"
-                    )
-                elif ranges.get(table.name) != self.ranges.get((row["key"], table.name)):
-                    self.report(
-                        table, "", f"revision {name} has other rows than its ranges of keys say"
-                    )
+            if self.since is None or number > self.since:
+                self._check_contents(row)
 
-    def _brought_by(self, session_key: int) -> Row | None:
-        revision = self.shown_again.get(session_key, self.revision_of[sessions][session_key])
-        return self.revision_rows.get(revision)
+    def _check_contents(self, row: Row) -> None:
+        """Compares the rows of a revision with what it says of them."""
+        name = str(row["number"])
+        try:
+            contents = from_json(row["contents"], f"revision {name}")
+            ranges = own_rows(row).ranges
+        except MapCorruptError as error:
+            self.report(revisions, name, str(error))
+            return
+        for table in (one for one in VERSIONED if not (self.thin and one is frames)):
+            found = self.brought[row["key"], table.name]
+            brought = contents.get(table.name, 0)
+            if brought != found:
+                self.report(
+                    table, "", f"revision {name} added {brought} rows, but {found} are stored"
+                )
+            elif ranges.get(table.name) != self.ranges.get((row["key"], table.name)):
+                self.report(
+                    table, "", f"revision {name} has other rows than its ranges of keys say"
+                )
 
     def result(self) -> CheckReport:
-        abandoned = {key for key, row in self.revision_rows.items() if row["status"] == "abandoned"}
-        writer = self.database.writer()
-        live = "" if writer is None else writer.token
-        interrupted = tuple(
-            identity
-            for key, identity in self.session_ids.items()
-            if (revision := self._brought_by(key)) is not None
-            and revision["status"] == "open"
-            and revision["writer"] != live
-        )
+        rows = self.revision_rows.values()
         return CheckReport(
             problems=tuple(self.problems),
             rows=self.rows,
             blobs=self.blobs,
-            interrupted=interrupted,
+            interrupted=tuple(self._interrupted()),
             abandoned_rows=sum(
-                revision in abandoned
-                for table in VERSIONED
-                for revision in self.revision_of[table].values()
+                self.stored[row["key"]] for row in rows if row["status"] == "abandoned"
             ),
         )
+
+    def _interrupted(self) -> Iterator[SessionId]:
+        """The sessions of open revisions without a writer."""
+        writer = self.database.writer()
+        live = "" if writer is None else writer.token
+        for row in self.revision_rows.values():
+            if row["status"] == "open" and row["writer"] != live:
+                with suppress(EngramError), self.database.reading() as connection:
+                    for session in sessions_of(connection, row["key"]):
+                        yield SessionId(uuid_from_bytes(session["uuid"], "a session"))
 
 
 def _check_format(_: _Checking, row: Row) -> None:
@@ -349,26 +448,22 @@ def _check_frontend(checking: _Checking, row: Row) -> None:
 def _check_session(checking: _Checking, row: Row) -> None:
     camera = checking.cameras.get(row["camera"])
     if camera is not None:
-        checking.session_ids[row["key"]] = session_from_row(row, camera.id).id
+        session_from_row(row, camera.id)
 
 
-def _check_node(checking: _Checking, row: Row) -> None:
+def _check_node(_: _Checking, row: Row) -> None:
     uuid_from_bytes(row["uuid"], "the row")
-    checking.landmark_hashes[row["key"]] = (
-        row["landmark_hash"],
-        row["camera"],
-        row["frontend"],
-    )
     FrameStatus(row["status"])
     if not np.isfinite(row["driven_m"]):
         raise MapCorruptError(f"driven_m is {row['driven_m']}")
 
 
 def _check_frame(checking: _Checking, row: Row) -> None:
-    expected, camera_key, frontend = checking.landmark_hashes.get(row["node"], (b"", -1, -1))
-    camera, kind = checking.cameras.get(camera_key), checking.kinds.get(frontend)
-    name = checking.uuids.get((nodes, row["node"]), "?")
-    if blob_hash(row["landmarks"]) != expected:
+    node = checking.known[nodes].get(row["node"], {})
+    camera = checking.cameras.get(node.get("camera", -1))
+    kind = checking.kinds.get(node.get("frontend", -1))
+    if blob_hash(row["landmarks"]) != node.get("landmark_hash"):
+        name = describe(nodes, list(node.values())) if node else "?"
         raise MapCorruptError(f"the landmarks are not those of node {name}")
     if camera is not None and kind is not None:
         checking.blobs += 1
@@ -415,7 +510,9 @@ def _check_attempts(checking: _Checking, row: Row) -> None:
     if revision is None:
         return  # reported already
     for name in ("reference", "node"):
-        for key in np.unique(getattr(table, name)).tolist():
+        keys = np.unique(getattr(table, name)).tolist()
+        checking._learn(nodes, keys)
+        for key in keys:
             fact = checking.reference_problem(revision, nodes, key)
             if fact:
                 raise MapCorruptError(f"a {name} {fact}")
@@ -451,11 +548,10 @@ def _check_vocabulary(checking: _Checking, row: Row) -> None:
 
 def _check_hidden(checking: _Checking, row: Row) -> None:
     table = metadata.tables.get(row["record"])
-    if table is None or row["target"] not in checking.revision_of.get(table, {}):
+    if table in _HIDEABLE:
+        checking._learn(table, [row["target"]])
+    if table not in _HIDEABLE or row["target"] not in checking.known[table]:
         raise MapCorruptError(f"hides row {row['target']} of {row['record']}, which is missing")
-    revision = checking.revision_rows.get(row["revision"])
-    if table is sessions and not row["hidden"] and revision and revision["status"] == "open":
-        checking.shown_again[row["target"]] = row["revision"]
 
 
 def _check_tag(checking: _Checking, row: Row) -> None:
@@ -465,7 +561,7 @@ def _check_tag(checking: _Checking, row: Row) -> None:
 
 
 def _check_words(checking: _Checking, row: Row) -> None:
-    if row["node"] not in checking.revision_of[nodes]:
+    if row["node"] not in checking.known[nodes]:
         raise MapCorruptError("the node is missing")
     checking.blobs += 1
     decode_words(row["body"])
@@ -486,6 +582,41 @@ def _check_rotation(rotation: np.ndarray[Any, np.dtype[np.float64]]) -> None:
         raise MapCorruptError(f"its rotation is off by {skew:.2g}")
 
 
+def _are_nodes(found: Columns) -> bool:
+    _, statuses = found.texts["status"]
+    return {*statuses} <= {*map(str, FrameStatus)} and bool(np.isfinite(found["driven_m"]).all())
+
+
+def _are_edges(found: Columns) -> bool:
+    _, kinds = found.texts["kind"]
+    transforms, _ = edge_arrays(found["a_from_b"], found["covariance"], found["key"])
+    return {*kinds} <= {*map(str, EdgeKind)} and _are_rotations(transforms)
+
+
+def _are_path_entries(found: Columns) -> bool:
+    _, kinds = found.texts["kind"]
+    return {*kinds} <= {*map(str, PathEntryKind)} and bool((found["sequence"] >= 0).all())
+
+
+def _are_placements(found: Columns) -> bool:
+    return _are_rotations(found["map_from_node"].view("<f8"))
+
+
+def _are_rotations(transforms: NDArray[np.float64]) -> bool:
+    """Whether (N, 12) numbers are finite, and the first nine of each are a rotation."""
+    rotations = transforms[:, :9].reshape(-1, 3, 3)
+    with np.errstate(over="ignore", invalid="ignore"):
+        skew = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
+    return bool(np.isfinite(transforms).all() and skew <= _ROTATION_TOLERANCE)
+
+
+# Of the largest tables many rows are checked at once; one after the other where these find a fault.
+_CHECKS_OF_COLUMNS: dict[Table, Callable[[Columns], bool]] = {
+    nodes: _are_nodes,
+    edges: _are_edges,
+    path_entries: _are_path_entries,
+    placements: _are_placements,
+}
 _ROW_CHECKS: dict[Table, Callable[[_Checking, Row], None]] = {
     map_format: _check_format,
     revisions: _check_revision,

@@ -54,6 +54,9 @@ _REFERENCES = {
 # since they follow from the rest to the rounding of a linear solver.
 _HASHED = tuple(table for table in VERSIONED if table not in {frames, placements})
 _LEFT_OUT = {"key", "checksum"}
+_NAMED_BY_UUID = (sessions, nodes, paths)
+# UUIDs of a table that are kept from one revision to the next.
+_MOST = 100_000
 _HISTORY = ("number", "parent", "author", "message", "tool_version", "configuration")
 
 
@@ -75,14 +78,15 @@ def content_hash(connection: Connection, at: int) -> str:
     return found
 
 
-def verified_hash(connection: Connection, at: int) -> str:
-    """`content_hash`, worked out again from all rows.
+def verified_hash(connection: Connection, at: int, since: int = 0) -> str:
+    """`content_hash`, worked out again from all rows; or from those after a revision.
 
     Raises:
         MapCorruptError: a row is damaged or points at nothing, or a stored hash is another.
     """
-    known, found = Identities(connection), EMPTY_HASH
-    query = select(revisions).where(revisions.c.number <= at).order_by(revisions.c.number)
+    known, found = Identities(connection), content_hash(connection, since)
+    query = select(revisions).where(revisions.c.number > since, revisions.c.number <= at)
+    query = query.order_by(revisions.c.number)
     for row in list(verified(revisions, connection.execute(query))):
         found = chained(connection, found, row, own_rows(row), known)
         if found != row["chain"]:
@@ -109,6 +113,7 @@ def chained(
         MapCorruptError: a row is damaged or points at nothing.
     """
     known = known or Identities(connection)
+    known.forget_many()
     known.add_revision(row["key"], row["number"])
     digest = hashlib.sha256(bytes.fromhex(before))
     digest.update(_encode([row[name] for name in _HISTORY]))
@@ -163,12 +168,18 @@ class Identities:
                 key: [str(descriptor), digest]
                 for key, (descriptor, digest) in load_frontends(connection).items()
             },
-            **{str(table.name): {} for table in (sessions, nodes, paths)},
+            **{str(table.name): {} for table in _NAMED_BY_UUID},
         }
 
     def add_revision(self, key: int, number: int) -> None:
         """Adds the revision that is being committed."""
         self._known["revisions"][key] = number
+
+    def forget_many(self) -> None:
+        """Forgets rows if there are so many of them that they are better read again."""
+        for table in _NAMED_BY_UUID:
+            if len(self._known[table.name]) > _MOST:
+                self._known[table.name].clear()
 
     def of(self, table: str, keys: Collection[int]) -> dict[int, Any]:
         """Those of at least these keys of a table.

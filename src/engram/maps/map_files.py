@@ -24,6 +24,7 @@ from engram.files import current_holder, map_path
 from engram.maps.checking import check
 from engram.maps.records import CheckReport, Problem
 from engram.maps.sqlite import SqliteDatabase
+from engram.maps.tags import resolve
 from engram.untrusted import open_regular
 
 _HEADER, _FRAME_HEAD = 32, 24
@@ -141,16 +142,21 @@ def publish_map(draft: Path, target: Path) -> None:
     SqliteDatabase.publish(draft, target)
 
 
-def check_file(location: Path | str, *, thin: bool = False) -> CheckReport:
+def check_file(
+    location: Path | str, *, thin: bool = False, since: int | str | None = None
+) -> CheckReport:
     """Verifies every byte of a map file, even of one too damaged to open.
 
     Args:
         location: the map.
         thin: whether frames of nodes may be missing, as in a hand-in.
+        since: number or name of the revision after which rows are verified; None for all of them,
+            and the structure of the file.
 
     Raises:
         NotAMapError: the file does not exist or is not a map.
         FormatVersionError: a newer Engram wrote it.
+        RevisionError: the map has no such revision.
     """
     path = map_path(location)
     lost = _log_problems(path)
@@ -159,8 +165,15 @@ def check_file(location: Path | str, *, thin: bool = False) -> CheckReport:
     except MapCorruptError as error:
         return CheckReport((*lost, Problem("file", "", str(error))), 0, 0, (), 0)
     with closing(database):
-        found = check(database, thin=thin)
+        found = check(database, thin=thin, since=_number(database, since))
     return replace(found, problems=(*lost, *found.problems))
+
+
+def _number(database: SqliteDatabase, named: int | str | None) -> int | None:
+    if named is None:
+        return None
+    with database.reading() as connection:
+        return resolve(connection, named, database.name)
 
 
 def _log_problems(path: Path) -> list[Problem]:

@@ -1,8 +1,6 @@
-"""What is visible as of a revision, in numbers: counted on from those of the revision before.
+"""What is visible as of a revision, in numbers: stored with it, or counted from all rows.
 
-A revision that only adds is counted by its own rows. One that hides, removes, moves or supersedes
-is counted with the whole map, in stretches of its rows. So is one whose edges join experiences of
-earlier revisions, since attempts on these then count otherwise.
+`engram.maps.counting` counts on from those of the revision before.
 """
 
 from __future__ import annotations
@@ -43,7 +41,7 @@ from engram.maps.view import LARGEST_KEY, View, few, places_in_history
 _EDGE_BYTES = {"a_from_b": 96, "covariance": 168}
 _NODE_BYTES = {"uuid": 16, "landmark_hash": 16}
 # Rows read at once.
-_AT_ONCE = 100_000
+_AT_ONCE = 20_000
 
 _Key = Annotated[int, msgspec.Meta(ge=0, le=LARGEST_KEY)]
 _Bins = Annotated[tuple[_Key, ...], msgspec.Meta(min_length=BIN_COUNT, max_length=BIN_COUNT)]

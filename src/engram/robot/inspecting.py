@@ -124,13 +124,13 @@ def amend_session(
     }
 
 
-def check_map(path: Path, *, clean: bool = False) -> dict[str, Any]:
-    """Checks a map for damage, for ``engram check``."""
+def check_map(path: Path, *, clean: bool = False, since: int | str | None = None) -> dict[str, Any]:
+    """Checks a map for damage, or the revisions after one, for ``engram check``."""
     removed = 0
     if clean:
         with Map.open(path, writes=True) as store:
             removed = store.clean()
-    report = check_file(path)
+    report = check_file(path, since=since)
     problems = [*report.problems, *vocabulary_problems(path)]
     return {
         "sound": not problems,
