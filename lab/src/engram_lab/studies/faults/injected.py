@@ -382,6 +382,7 @@ FAULTS: dict[str, Fault] = {
             "rain and a wiper", "mm/h", 0.5, 25.0,
             partial(rained_on, glass=Glass(distance_mm=40.0, wiped_every_s=2.0)),
         ),
+        Fault("rain under a hood", "mm/h", 0.5, 25.0, partial(rained_on, glass=Glass(hood=1.0))),
         Fault("car ahead", "of the image", 0.1, 0.7, changed(with_car, 40)),
         Fault("kidnapped", "frames", 10, 60, kidnapped),
         Fault("fixed pattern", "of the image", 0.1, 0.6, fixed_pattern, True),
