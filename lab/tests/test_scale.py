@@ -13,7 +13,7 @@ from engram.maps.map_files import check_file
 from engram.places.recognisers import PLACES_PER_BLOCK, FabMap
 from engram.places.vocabulary import default_vocabulary
 from engram.places.words import NodeWords, PlaceBook
-from engram_lab.studies.scale import City, Figures, ask, drive_in, table, write_in
+from engram_lab.studies.scale import City, Figures, ask, drive_in, look_back, table, write_in
 
 
 def test_a_city_is_a_sound_map_that_localises(tmp_path: Path) -> None:
@@ -31,6 +31,7 @@ def test_a_city_is_a_sound_map_that_localises(tmp_path: Path) -> None:
     before = path.read_bytes()
     assert all(seconds >= 0 for seconds in write_in(path, city).values())
     assert set(ask(path, city)) == {"info (s)", "log (s)", "show NODE (s)"}
+    assert {"diff (s)", "check --since (s)", "revert (s)"} < look_back(path, city).keys()
     assert path.read_bytes() == before
 
 

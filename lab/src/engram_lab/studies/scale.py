@@ -41,8 +41,9 @@ from engram.graph.placing import MAP_FROM_CAMERA
 from engram.localiser.localisation import Position
 from engram.maps import schema
 from engram.maps.attempts import encode_words, pack
-from engram.maps.history import blame_node, map_log
+from engram.maps.history import blame_node, map_log, show_revision
 from engram.maps.map import Map
+from engram.maps.map_files import check_file
 from engram.maps.rows import camera_row, covariance_bytes, session_row, to_json, transform_bytes
 from engram.maps.sqlite import SqliteDatabase
 from engram.maps.upgrading import complete_history
@@ -422,11 +423,34 @@ def _write_drive(opened: Map, city: City, number: int, count: int) -> list[float
 def ask(path: Path, city: City) -> dict[str, float]:
     """What people ask of a map: seconds that each question takes."""
     node = str(city.node(city.driven, 1, 10).id)
-    questions: Mapping[str, Callable[[], object]] = {
-        "info": lambda: describe_map(path),
-        "log": lambda: map_log(path),
-        "show NODE": lambda: blame_node(path, node),
-    }
+    return _seconds(
+        {
+            "info": lambda: describe_map(path),
+            "log": lambda: map_log(path),
+            "show NODE": lambda: blame_node(path, node),
+        }
+    )
+
+
+def look_back(path: Path, city: City) -> dict[str, float]:
+    """What a drive of 500 nodes changed in a copy of the map, and what its revert would change."""
+    with TemporaryDirectory(dir=path.parent) as folder:
+        shutil.copy(path, copied := Path(folder) / path.name)
+        with Map.open(copied, writes=True) as opened:
+            _write_drive(opened, city, 0, 500)
+            return _seconds(
+                {
+                    "show": lambda: show_revision(copied, "head")[1].text(),
+                    "diff": lambda: opened.diff("head~1", "head").text(),
+                    "check --since": lambda: check_file(copied, since="head~1"),
+                    "tag": lambda: opened.tag("seen", author="scale"),
+                    "revert --dry-run": lambda: opened.revert("head", author="", dry_run=True),
+                    "revert": lambda: opened.revert("head", author="scale"),
+                }
+            )
+
+
+def _seconds(questions: Mapping[str, Callable[[], object]]) -> dict[str, float]:
     found = {}
     for name, question in questions.items():
         begun = time.process_time()
@@ -439,6 +463,7 @@ MEASURES: Mapping[str, Callable[[Path, City], dict[str, float]]] = {
     "robot": drive_in,
     "writing": write_in,
     "questions": ask,
+    "history": look_back,
 }
 
 
