@@ -35,14 +35,6 @@ from engram.maps.schema import (
 from engram.maps.totals import Own, own_rows
 from engram.maps.view import View
 
-_SIZES = {
-    "uuid": 16,
-    "landmark_hash": 16,
-    "a_from_b": 96,
-    "covariance": 168,
-    "map_from_node": 96,
-    "node_from_omitted": 96,
-}
 # Tables whose rows are read whole. Of sessions and attempts only these columns are read.
 _WHOLE = (nodes, edges, paths, path_entries, omissions, placements)
 _PARTLY = {
@@ -134,7 +126,7 @@ def columns_of(table: Table, rows: Iterable[tuple[Any, ...]]) -> Columns:
     if table in _PARTLY:
         columns = np.array(list(rows), np.int64).reshape(-1, len(_PARTLY[table]))
         return Columns(dict(zip(_PARTLY[table], columns.T, strict=True)), {})
-    return Columns.verified(table, list(rows), _SIZES)
+    return Columns.verified(table, list(rows))
 
 
 def _touched(

@@ -107,7 +107,6 @@ assert set(_ORDER) == set(metadata.sorted_tables)
 
 _DERIVED = {words, place_blocks, runs}
 _HIDEABLE = {*VERSIONED} - {hidden}
-_SIZES = {"uuid": 16, "landmark_hash": 16, "a_from_b": 96, "covariance": 168, "map_from_node": 96}
 # Rows of the largest tables that are read at once, and of those with large bodies.
 _MOST = 10_000
 _AT_ONCE = {frames: 20, attempts: 10, vocabularies: 1, place_blocks: 1}
@@ -203,7 +202,7 @@ class _Checking:
     def _are_sound(self, table: Table, part: list[tuple[Any, ...]]) -> bool:
         """Whether all these rows and their references are sound, without saying which is not."""
         try:
-            found = Columns.verified(table, part, _SIZES)
+            found = Columns.verified(table, part)
             if not _CHECKS_OF_COLUMNS[table](found):
                 return False
         except MapCorruptError:

@@ -38,11 +38,9 @@ class Columns:
         return len(self.values["revision"])
 
     @staticmethod
-    def verified(
-        table: Table, rows: Sequence[tuple[Any, ...]], sizes: Mapping[str, int]
-    ) -> Columns:
+    def verified(table: Table, rows: Sequence[tuple[Any, ...]]) -> Columns:
         """Those of rows, in their order; see `verified_arrays`."""
-        named = verified_arrays(table, list(rows), sizes)
+        named = verified_arrays(table, list(rows))
         return Columns(
             {name: array for name, array in named.items() if not isinstance(array, tuple)},
             {name: array for name, array in named.items() if isinstance(array, tuple)},
@@ -68,7 +66,6 @@ def read_columns(
     connection: Connection,
     view: View,
     table: Table,
-    sizes: Mapping[str, int] | None = None,
     *,
     within: tuple[int, int] | None = None,
 ) -> Columns:
@@ -78,7 +75,6 @@ def read_columns(
         connection: a connection for reading.
         view: which rows are visible.
         table: has neither columns that may be empty nor bytes of varying number.
-        sizes: number of bytes in each column of bytes.
         within: only rows with primary keys from the first up to the second.
 
     Raises:
@@ -89,16 +85,14 @@ def read_columns(
         query = query.where(table.primary_key.columns[0].between(*within))
     found = connection.execute(query).cursor
     assert found is not None
-    whole = Columns.verified(table, found.fetchall(), sizes or {})
+    whole = Columns.verified(table, found.fetchall())
     return _in_history(connection, whole)
 
 
-def verified_arrays(
-    table: Table, rows: list[tuple[Any, ...]], sizes: Mapping[str, int]
-) -> dict[str, Any]:
+def verified_arrays(table: Table, rows: list[tuple[Any, ...]]) -> dict[str, Any]:
     """The columns of rows, each checked against its checksum; see `_core.verified_columns`."""
     columns = list(table.columns)[:-1]
-    kinds = [_KINDS.get(column.type.python_type) or f"b{sizes[column.name]}" for column in columns]
+    kinds = [_KINDS.get(column.type.python_type) or f"b{column.info['size']}" for column in columns]
     arrays, bad, at = _core.verified_columns(rows, kinds)
     if arrays is None:
         if at < 0:

@@ -96,7 +96,7 @@ def _removals(connection: Connection, rows: list[Row]) -> tuple[Removal, ...]:
 def load_placements(connection: Connection, view: View) -> dict[NodeId, SE3]:
     """The newest ``map_from_node`` of each placed node."""
     ids = _all_node_ids(connection, view)
-    found = read_columns(connection, view, placements, {"map_from_node": 96}).newest("node")
+    found = read_columns(connection, view, placements).newest("node")
     keys, placed = found["key"], found["node"].tolist()
     poses = transforms_from_bytes(found["map_from_node"], lambda at: f"placement {keys[at]}")
     return {ids[node]: pose for node, pose in zip(placed, poses, strict=True) if node in ids}

@@ -61,8 +61,6 @@ from engram.maps.view import View, head
 
 # Dense indices are of 32 bits; what a process adds follows after those of the map.
 _LARGEST_KEY = 2**31 - 2**24
-_NODE_SIZES = {"uuid": 16, "landmark_hash": 16}
-_EDGE_SIZES = {"a_from_b": 96, "covariance": 168}
 
 
 class MapPages:
@@ -102,9 +100,9 @@ class MapPages:
         """See `GraphPages`."""
         keys = {"first": number * PAGE + 1, "last": (number + 1) * PAGE}
         with reading_rows(self._database.name):
-            found = self._seen(nodes, self._database.rows(_NODES, keys), _NODE_SIZES)
+            found = self._seen(nodes, self._database.rows(_NODES, keys))
             found = found.rows(np.argsort(found["key"], kind="stable"))
-            joined = self._seen(edges, self._database.rows(_EDGES, keys), _EDGE_SIZES)
+            joined = self._seen(edges, self._database.rows(_EDGES, keys))
             return GraphPage(
                 number,
                 (found["key"] - 1).astype(np.int32),
@@ -182,7 +180,7 @@ class MapPages:
     def edges(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
         """See `GraphPages`."""
         with self._database.reading() as connection:
-            found = read_columns(connection, self._view, edges, _EDGE_SIZES)
+            found = read_columns(connection, self._view, edges)
         ends, _, poses, _ = self._edges(found)
         return ends, poses
 
@@ -198,7 +196,7 @@ class MapPages:
                 for query in (_ENTRIES, _SAME_PLACES)
                 for row in self._database.rows(query, keys)
             }
-            found = self._seen(path_entries, list(rows.values()), {})
+            found = self._seen(path_entries, list(rows.values()))
             known = np.isin(found["path"], list(self._path_numbers))
             found = found.rows(np.flatnonzero(known)).newest("path", "sequence")
             here = (found["node"] > first) & (found["node"] <= end)
@@ -232,9 +230,9 @@ class MapPages:
         """The evidence of a range; `known` takes successes and failures by page of attempts."""
         keys = {"first": first + 1, "last": end}
         with reading_rows(self._database.name):
-            found = self._seen(nodes, self._database.rows(_NODES, keys), _NODE_SIZES)
+            found = self._seen(nodes, self._database.rows(_NODES, keys))
             found = found.rows(np.argsort(found["key"], kind="stable"))
-            joined = self._seen(edges, self._database.rows(_STEPS, keys), _EDGE_SIZES)
+            joined = self._seen(edges, self._database.rows(_STEPS, keys))
             at, sessions = (found["key"] - 1).astype(np.int32), self._numbered(found)
             links = np.searchsorted(at, self._edges(joined)[0])
             links = links[sessions[links[:, 0]] == sessions[links[:, 1]]]
@@ -314,11 +312,9 @@ class MapPages:
             )
         return self._silent[path]
 
-    def _seen(
-        self, table: Table, rows: Sequence[tuple[Any, ...]], sizes: dict[str, int]
-    ) -> Columns:
+    def _seen(self, table: Table, rows: Sequence[tuple[Any, ...]]) -> Columns:
         """The visible ones of some rows, verified, by revision and then by key."""
-        found = Columns.verified(table, rows, sizes)
+        found = Columns.verified(table, rows)
         found = found.rows(np.flatnonzero(self._visible.shows(table, found)))
         return self._visible.in_history(found)
 

@@ -337,7 +337,7 @@ def _nodes(
     session_ids: dict[int, SessionId],
 ) -> tuple[NDArray[np.int64], tuple[Node, ...]]:
     """Keys (N,) and records of the nodes."""
-    found = read_columns(connection, view, nodes, {"uuid": 16, "landmark_hash": 16})
+    found = read_columns(connection, view, nodes)
     uuids = found["uuid"].tobytes()
     columns = [found[name].tolist() for name in ("key", "session", "camera", "stamp_ns")]
     records = []
@@ -365,8 +365,7 @@ def _edges(
     connection: Connection, view: View, node_keys: NDArray[np.int64], node_list: tuple[Node, ...]
 ) -> EdgeTable:
     """Edges between visible nodes: those of hidden nodes are hidden with them."""
-    sizes = {"a_from_b": 96, "covariance": 168}
-    found = read_columns(connection, view, edges, sizes).newest("a", "b", "kind")
+    found = read_columns(connection, view, edges).newest("a", "b", "kind")
     found = without_removed(removed_measurements(view.rows(connection, removals)), found)
     (a, a_seen), (b, b_seen) = (_dense(found[end], node_keys) for end in ("a", "b"))
     seen = np.flatnonzero(a_seen & b_seen)

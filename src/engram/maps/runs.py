@@ -189,7 +189,7 @@ def load_runs(connection: Connection) -> Runs | None:
     found = connection.execute(select(table).order_by(table.c.key)).cursor
     assert found is not None
     try:
-        arrays = verified_arrays(table, list(found.fetchall()), {})
+        arrays = verified_arrays(table, list(found.fetchall()))
     except MapCorruptError:
         return None
     return Runs(*(arrays[name] for name in ("key", "last", *_LABELS)))

@@ -47,8 +47,19 @@ def _text(name: str, note: str = "", *, nullable: bool = False) -> Column[str]:
     return Column(name, Text(), nullable=nullable, info={"note": note})
 
 
-def _bytes(name: str, note: str = "", *, nullable: bool = False) -> Column[bytes]:
-    return Column(name, LargeBinary(), nullable=nullable, info={"note": note})
+def _bytes(
+    name: str, note: str = "", *, nullable: bool = False, size: int | None = None
+) -> Column[bytes]:
+    """Bytes; `size` of them if all values have equally many."""
+    return Column(name, LargeBinary(), nullable=nullable, info={"note": note, "size": size})
+
+
+def _uuid(note: str = "") -> Column[bytes]:
+    return _bytes("uuid", note, size=16)
+
+
+def _transform(name: str, note: str = "transform") -> Column[bytes]:
+    return _bytes(name, note, size=96)
 
 
 def _table(name: str, *items: SchemaItem) -> Table:
@@ -106,7 +117,7 @@ frontends = _table(
 sessions = _table(
     "sessions",
     _key(),
-    _bytes("uuid"),
+    _uuid(),
     _int("revision"),
     _text("robot"),
     _int("camera"),
@@ -121,7 +132,7 @@ sessions = _table(
 nodes = _table(
     "nodes",
     _key(),
-    _bytes("uuid"),
+    _uuid(),
     _int("revision"),
     _int("session"),
     _int("camera"),
@@ -129,7 +140,7 @@ nodes = _table(
     _int("stamp_ns"),
     _float("driven_m"),
     _text("status", "of the frame"),
-    _bytes("landmark_hash"),
+    _bytes("landmark_hash", size=16),
     UniqueConstraint("uuid"),
     Index("nodes_by_session", "session"),
 )
@@ -150,8 +161,8 @@ edges = _table(
     _int("a"),
     _int("b"),
     _text("kind"),
-    _bytes("a_from_b", "transform"),
-    _bytes("covariance", "168 bytes: upper triangle of the 6×6 row by row, float64"),
+    _transform("a_from_b"),
+    _bytes("covariance", "168 bytes: upper triangle of the 6×6 row by row, float64", size=168),
     UniqueConstraint("a", "b", "kind", "revision"),
     Index("edges_by_b", "b"),
 )
@@ -159,7 +170,7 @@ edges = _table(
 paths = _table(
     "paths",
     _key(),
-    _bytes("uuid"),
+    _uuid(),
     _int("revision"),
     _int("session"),
     _int("partial", "1 if some entries stayed elsewhere"),
@@ -182,10 +193,10 @@ path_entries = _table(
 omissions = _table(
     "omissions",
     _key(),
-    _bytes("uuid", "of a node that was not taken"),
+    _uuid("of a node that was not taken"),
     _int("revision"),
     _int("node", "its equivalent"),
-    _bytes("node_from_omitted", "transform"),
+    _transform("node_from_omitted"),
     UniqueConstraint("uuid", "revision"),
 )
 
@@ -193,9 +204,9 @@ omissions = _table(
 omitted_landmarks = _table(
     "omitted_landmarks",
     _key(),
-    _bytes("uuid", "of such a node"),
+    _uuid("of such a node"),
     _int("revision"),
-    _bytes("landmark_hash"),
+    _bytes("landmark_hash", size=16),
     UniqueConstraint("uuid", "revision"),
 )
 
@@ -297,7 +308,7 @@ removals = _table(
     _int("a"),
     _int("b"),
     _text("kind"),
-    _bytes("a_from_b", "transform"),
+    _transform("a_from_b"),
     _text("reason"),
     _int("removed_ns"),
 )
@@ -308,7 +319,7 @@ placements = _table(
     _key(),
     _int("revision"),
     _int("node"),
-    _bytes("map_from_node", "transform"),
+    _transform("map_from_node"),
     Index("placements_by_node", "node"),
 )
 
@@ -332,7 +343,7 @@ goals = _table(
     _int("revision"),
     _text("name"),
     _int("node"),
-    _bytes("node_from_goal", "transform"),
+    _transform("node_from_goal"),
 )
 
 # Which nodes are connected as of the newest revision: runs of visible nodes, each by its first one.

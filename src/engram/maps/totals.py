@@ -38,8 +38,6 @@ from engram.maps.schema import (
 )
 from engram.maps.view import LARGEST_KEY, View, few, places_in_history
 
-_EDGE_BYTES = {"a_from_b": 96, "covariance": 168}
-_NODE_BYTES = {"uuid": 16, "landmark_hash": 16}
 # Rows read at once.
 _AT_ONCE = 20_000
 
@@ -145,12 +143,10 @@ class Own:
         key = table.primary_key.columns[0]
         return key.between(first, last) & (table.c.revision == self.key)
 
-    def columns(
-        self, connection: Connection, table: Table, sizes: Mapping[str, int] | None = None
-    ) -> Columns:
+    def columns(self, connection: Connection, table: Table) -> Columns:
         """Those of one table, verified."""
         view, within = View(0, self.key), self.ranges.get(table.name, (0, -1))
-        return read_columns(connection, view, table, sizes, within=within)
+        return read_columns(connection, view, table, within=within)
 
 
 def own_rows(row: Row) -> Own:
@@ -204,12 +200,12 @@ def _count_graph(connection: Connection, view: View, before: Totals) -> tuple[To
     found = before
     known = [
         (part["key"], part["session"], part["camera"])
-        for part in _stretches(connection, view, nodes, _NODE_BYTES)
+        for part in _stretches(connection, view, nodes)
     ]
     owners = Owners(connection, *(np.concatenate(part) for part in zip(*known, strict=True)))
     runs = Runs.of(owners.nodes)
     skipped = np.array(sorted(_uncounted(connection, view)), np.int64)
-    for stretch in _stretches(connection, view, edges, _EDGE_BYTES):
+    for stretch in _stretches(connection, view, edges):
         part = stretch.rows(np.flatnonzero(~np.isin(stretch["key"], skipped)))
         found, runs = with_edges(found, part, owners), runs.joined(*joints(part, owners))
     return found.of_runs(runs), runs
@@ -338,9 +334,7 @@ def _are_steps(added: Columns) -> NDArray[np.bool_]:
     return np.isin(codes, [at for at, text in enumerate(texts) if text == EdgeKind.ODOMETRY])
 
 
-def _stretches(
-    connection: Connection, view: View, table: Table, sizes: Mapping[str, int]
-) -> Iterator[Columns]:
+def _stretches(connection: Connection, view: View, table: Table) -> Iterator[Columns]:
     """The visible rows of a table by key, so many at once; one stretch at least."""
     key = table.primary_key.columns[0]
     last = connection.execute(select(func.max(key))).scalar() or 0
@@ -349,7 +343,7 @@ def _stretches(
         query = select(key).where(key >= start).order_by(key).offset(_AT_ONCE - 1).limit(1)
         end = connection.execute(query).scalar()
         stop = last if end is None else end
-        yield read_columns(connection, view, table, sizes, within=(start, stop))
+        yield read_columns(connection, view, table, within=(start, stop))
         if stop >= last:
             return
         start = stop + 1
@@ -400,7 +394,7 @@ def right_m_of(connection: Connection, view: View) -> float | None:
     """The largest x of the newest place of each node, metres, from all places."""
     parts = [
         (part["node"], part["revision"], part["key"], part["map_from_node"].view("<f8")[:, 9])
-        for part in _stretches(connection, view, placements, {"map_from_node": 96})
+        for part in _stretches(connection, view, placements)
     ]
     node, revision, key, x_m = (np.concatenate(one) for one in zip(*parts, strict=True))
     place_of = places_in_history(connection)

@@ -440,7 +440,7 @@ def look_back(path: Path, city: City) -> dict[str, float]:
             _write_drive(opened, city, 0, 500)
             return _seconds(
                 {
-                    "show": lambda: show_revision(copied, "head")[1].text(),
+                    "show": lambda: show_revision(copied, "head"),
                     "diff": lambda: opened.diff("head~1", "head").text(),
                     "check --since": lambda: check_file(copied, since="head~1"),
                     "tag": lambda: opened.tag("seen", author="scale"),
