@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from engram.errors import RevisionError
@@ -143,6 +143,12 @@ STEP = st.tuples(
 )
 
 
+# An edge is measured again between nodes of which another edge was removed.
+@example(
+    steps=[("drive", 0, 1), ("remove", 0, 0), ("measure", 1, 0), ("drive", 1, 2)]
+    + [("measure", 1, 0)] * 2,
+    pair=(0, 0),
+)
 @given(steps=st.lists(STEP, min_size=3, max_size=8), pair=st.tuples(*[st.integers(0, 20)] * 2))
 @settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
 def test_any_history_is_counted_on_and_compared(steps: list[Step], pair: tuple[int, int]) -> None:

@@ -360,8 +360,8 @@ def _uncounted(connection: Connection, view: View) -> set[int]:
     for removal in view.rows(connection, removals):
         between = or_(*(and_(edges.c.a == a, edges.c.b == b) for a, b in _both_ways(removal)))
         rows = list(verified(edges, connection.execute(view.select(edges).where(between))))
-        found |= {row["key"] for row in rows}
-        found -= {row["key"] for row in counting(connection, view, rows)}
+        counted = {row["key"] for row in counting(connection, view, rows)}
+        found |= {row["key"] for row in rows} - counted
     return found
 
 
