@@ -101,15 +101,24 @@ class Changes:
     tables: Mapping[Table, Touched]
 
     @staticmethod
-    def between(connection: Connection, before: View, after: View) -> Changes:
+    def between(
+        connection: Connection, before: View, after: View, own: Own | None = None
+    ) -> Changes:
         """What differs between two views, either of which may be the older one.
+
+        Args:
+            connection: of the map.
+            before, after: the views.
+            own: the rows of the one revision between, if known.
 
         Raises:
             MapCorruptError: a row does not match its checksum.
         """
         shown = Visible.of(connection, before, after)
-        found = _Search(connection, shown).rows()
-        gone = _removed(connection, before), _removed(connection, after)
+        found = _Search(connection, shown, own).rows()
+        removed = verified(removals, connection.execute(select(removals).order_by(removals.c.key)))
+        rows = list(removed)
+        gone = _removed(shown[0], rows), _removed(shown[1], rows)
         tables = {one: _touched(one, rows, shown, gone) for one, rows in found.items()}
         return Changes(shown[0], shown[1], gone, tables)
 
@@ -117,8 +126,13 @@ class Changes:
         return self.tables[table]
 
 
-def _removed(connection: Connection, view: View) -> Removed:
-    return removed_measurements(view.rows(connection, removals))
+def _removed(shown: Visible, rows: Sequence[dict[str, Any]]) -> Removed:
+    return removed_measurements(
+        row
+        for row in rows
+        if shown.has(removals, row["key"], row["revision"])
+        and not {row["a"], row["b"]} & shown.hidden_of(nodes)
+    )
 
 
 def columns_of(table: Table, rows: Iterable[tuple[Any, ...]]) -> Columns:
@@ -154,17 +168,20 @@ class _Search:
     Args:
         connection: of the map.
         shown: what the two views show.
+        own: the rows of the one revision between, if known.
     """
 
-    def __init__(self, connection: Connection, shown: Sequence[Visible]) -> None:
+    def __init__(self, connection: Connection, shown: Sequence[Visible], own: Own | None) -> None:
         self._connection = connection
         self._found: dict[Table, _Rows] = {one: {} for one in (*_WHOLE, *_PARTLY)}
         apart = shown[0].places.keys() ^ shown[1].places.keys()
-        self._between = list(_own_of(connection, apart))
+        self._between = list(_own_of(connection, apart)) if own is None else [own]
         # Keys of rows that are hidden or shown again, by name of the table.
         self._told: dict[str, list[int]] = defaultdict(list)
-        for own in self._between if any(hidden.name in one.ranges for one in self._between) else ():
-            query = select(hidden).where(own.rows(hidden)).order_by(hidden.c.key)
+        for one in self._between:
+            if hidden.name not in one.ranges:
+                continue
+            query = select(hidden).where(one.rows(hidden)).order_by(hidden.c.key)
             for row in verified(hidden, connection.execute(query)):
                 self._told[row["record"]].append(row["target"])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from sqlalchemy import Connection, Table, func, select
 
 from engram import _core
 from engram.errors import MapCorruptError
-from engram.maps.rows import describe, mismatch
+from engram.maps.rows import Row, describe, mismatch, verified
 from engram.maps.schema import attempts, edges, hidden, nodes, path_entries, revisions
 from engram.maps.view import View, place_in_history, places_in_history
 
@@ -173,6 +173,13 @@ class Visible:
     def hidden_of(self, table: Table) -> frozenset[int]:
         """Keys of the table's hidden rows."""
         return self.hidden.get(table.name, _NONE)
+
+    def rows(self, connection: Connection, table: Table) -> Iterator[Row]:
+        """The visible rows of a table without references to nodes, verified, by key."""
+        query = select(table).order_by(table.primary_key.columns[0])
+        for row in verified(table, connection.execute(query)):
+            if self.has(table, next(iter(row.values())), row["revision"]):
+                yield row
 
     def shows(self, table: Table, rows: Columns) -> NDArray[np.bool_]:
         """(N,) whether rows are visible: those that refer to a hidden node are hidden with it."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -181,6 +181,12 @@ class Identities:
             if len(self._known[table.name]) > _MOST:
                 self._known[table.name].clear()
 
+    def learn(self, table: Table, rows: Sequence[Sequence[Any]]) -> None:
+        """Adds rows of a table that were read."""
+        if table.name in self._known and "uuid" in table.c:
+            key, uuid = (table.columns.keys().index(name) for name in ("key", "uuid"))
+            self._known[table.name].update((row[key], row[uuid]) for row in rows)
+
     def of(self, table: str, keys: Collection[int]) -> dict[int, Any]:
         """Those of at least these keys of a table.
 
@@ -210,6 +216,7 @@ def _canonical_rows(
     if table is hidden:
         return _canonical_hidden(connection, list(verified(table, found)), known)
     rows = list(verified_values(table, found))
+    known.learn(table, rows)
     names = [column.name for column in table.columns]
     # Tens of thousands of rows: what is the same for all of them is looked up once.
     columns = [

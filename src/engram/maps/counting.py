@@ -22,8 +22,17 @@ from engram.maps.reading import descriptor_of, load_cameras
 from engram.maps.records import MapInfo
 from engram.maps.rows import verified
 from engram.maps.runs import Keys, Runs
-from engram.maps.schema import attempts, edges, nodes, path_entries, paths, placements, sessions
+from engram.maps.schema import (
+    attempts,
+    edges,
+    nodes,
+    path_entries,
+    paths,
+    placements,
+    sessions,
+)
 from engram.maps.totals import (
+    Own,
     Owners,
     Totals,
     basin_of,
@@ -65,12 +74,20 @@ def info(connection: Connection, view: View, *, size_bytes: int) -> MapInfo:
     )
 
 
-def count_open(connection: Connection, view: View) -> tuple[Totals, Runs, Runs | None]:
-    """The totals and runs with an open revision, and the stored runs, if they fit."""
+def count_open(
+    connection: Connection, view: View, own: Own | None = None
+) -> tuple[Totals, Runs, Runs | None]:
+    """The totals and runs with an open revision, and the stored runs, if they fit.
+
+    Args:
+        connection: of the map.
+        view: the newest revision and the open one.
+        own: the rows of the open one, if known.
+    """
     before, runs = state_at_head(connection, view.at)
     if runs is None:
         return *count_all(connection, view), None
-    changes = Changes.between(connection, View(view.at), view)
+    changes = Changes.between(connection, View(view.at), view, own)
     return *count_on(connection, view, before, runs, changes), runs
 
 

@@ -17,6 +17,7 @@ from engram.frontend.blobs import blob_hash, decode_landmarks, decode_thumbnail,
 from engram.frontend.frame import DescriptorKind, Frame, FrameStatus
 from engram.geometry.cameras import StereoCamera
 from engram.graph.model import Node, NodeId
+from engram.maps.columns import Visible
 from engram.maps.reading import load_cameras, load_frontends
 from engram.maps.records import StoredNode
 from engram.maps.rows import Row, verified
@@ -180,9 +181,9 @@ class FrameReader:
     def set_view(self, view: View) -> None:
         """Changes the visible revision."""
         with self._database.reading() as connection:
-            self._revisions = frozenset(connection.execute(view.revision_keys()).scalars())
-            found = connection.execute(view.hidden_keys(nodes))
-            self._hidden = frozenset(row[0] for row in found)
+            (seen,) = Visible.of(connection, view)
+            self._revisions = frozenset(seen.places)
+            self._hidden = seen.hidden_of(nodes)
             self._cameras: dict[int, StereoCamera] = load_cameras(connection)
             self._frontends: dict[int, tuple[DescriptorKind, str]] = load_frontends(connection)
 

@@ -6,7 +6,7 @@ later are shown by a newer `hidden` row; of the rows for one target the newest c
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from sqlalchemy import Connection, Table, insert, select
 from engram.counts import counted
 from engram.errors import InputError, RevisionError
 from engram.graph.model import Node, Session
+from engram.maps.columns import Visible
 from engram.maps.difference import MapDifference, difference
 from engram.maps.records import Revision
 from engram.maps.rows import Row, sealed, session_row, verified
@@ -95,18 +96,15 @@ def hidden_row(keys: KeyBook, revision_key: int, table: Table, target: int, *, h
     return sealed(hidden, row)
 
 
-def hidden_rows(connection: Connection, view: View, table: Table) -> dict[Any, Row]:
-    """The rows that a revert has hidden, by UUID or by path and sequence."""
-    query = (
-        select(table)
-        .where(table.c.key.in_(view.hidden_keys(table)))
-        .where(table.c.revision.in_(view.revision_keys()))
-        .order_by(table.c.key)
-    )
-    rows: Iterable[Row] = verified(table, connection.execute(query))
-    if table is path_entries:
-        return {(row["path"], row["sequence"]): row for row in rows}
-    return {row["uuid"]: row for row in rows}
+def hidden_rows(connection: Connection, seen: Visible, table: Table) -> dict[bytes, Row]:
+    """The rows that a revert has hidden, by UUID."""
+    found = {}
+    for part in few(sorted(seen.hidden_of(table))):
+        query = select(table).where(table.c.key.in_(part)).order_by(table.c.key)
+        for row in verified(table, connection.execute(query)):
+            if row["revision"] in seen.places:
+                found[row["uuid"]] = row
+    return found
 
 
 def check_same_node(row: Row, node: Node, landmark_hash: bytes) -> None:

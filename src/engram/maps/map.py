@@ -62,10 +62,10 @@ from engram.maps.records import (
     MapContents,
     MapInfo,
     Revision,
-    RevisionStatus,
     SessionState,
 )
 from engram.maps.revisions import (
+    brought,
     change_revision,
     collect_abandoned,
     commit_revision,
@@ -794,7 +794,7 @@ class Map:
                 connection.execute(insert(revisions), [sealed(revisions, opened)])
                 own = View(self._view.at, opened["key"])
                 hide_revision(connection, self._keys, own, number, opened["key"])
-                revision = commit_revision(connection, opened["key"], was=RevisionStatus.ABANDONED)
+                revision = commit_revision(connection, opened, *brought(connection, opened))
                 done = compare(connection, number, self.revision, revision)
                 if dry_run:
                     raise _DryRunError

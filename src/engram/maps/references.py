@@ -12,6 +12,7 @@ from engram.frontend.frame import DescriptorKind
 from engram.geometry.cameras import StereoCamera
 from engram.graph.model import NodeId
 from engram.maps import reading
+from engram.maps.columns import Visible
 from engram.maps.records import StoredNode
 from engram.maps.row_buffer import RowBuffer
 from engram.maps.rows import camera_row
@@ -48,13 +49,20 @@ class References:
             self._cameras = {
                 camera.id: key for key, camera in reading.load_cameras(connection).items()
             }
+            (seen,) = Visible.of(connection, view)
             self.sessions: dict[bytes, tuple[int, int, int]] = {
                 row["uuid"]: (row["key"], row["camera"], row["frontend"])
-                for row in view.rows(connection, sessions)
+                for row in seen.rows(connection, sessions)
             }
             self.paths: dict[bytes, int] = {
-                row["uuid"]: row["key"] for row in view.rows(connection, paths)
+                row["uuid"]: row["key"] for row in seen.rows(connection, paths)
             }
+
+    @property
+    def descriptor(self) -> DescriptorKind | None:
+        """The kind of all descriptors; None before the first session."""
+        used = {frontend for _, _, frontend in self.sessions.values()}
+        return next((kind for (kind, _), key in self._frontends.items() if key in used), None)
 
     def camera(self, camera: StereoCamera) -> int:
         """Key of a camera, added if new."""
@@ -92,6 +100,10 @@ class References:
         used, inverse = np.unique(indices, return_inverse=True)
         keys = [self.node(node_ids[int(index)], "attempt") for index in used]
         return np.array(keys, np.int64)[inverse]
+
+    def begin_path(self, path_key: int) -> None:
+        """Announces a path without entries."""
+        self._sequences[path_key] = set()
 
     def sequences(self, path_key: int) -> set[int]:
         """Sequence numbers of the visible entries of a path; the caller adds new ones."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from typing import Any
 
-from sqlalchemy import Connection, delete, func, select, update
+from sqlalchemy import Connection, Table, delete, func, select, update
 
 from engram import __version__
 from engram.errors import MapCorruptError, RevisionError
@@ -86,28 +86,23 @@ def new_revision(
 
 def commit_revision(
     connection: Connection,
-    revision_key: int,
-    *,
-    was: RevisionStatus = RevisionStatus.OPEN,
+    row: Row,
+    contents: Mapping[str, float],
+    own: Own,
     committed_ns: int | None = None,
 ) -> Revision:
     """Commits a revision and gives it its number.
 
     Args:
         connection: in a transaction that includes this step.
-        revision_key: key of its row.
-        was: its status so far.
+        row: its row.
+        contents, own: what it has `brought`.
         committed_ns: when, UTC; None for now.
-
-    Raises:
-        RevisionError: it has another status.
     """
     parent = head(connection)
-    row = revision_row(connection, revision_key, was)
-    contents, own = brought(connection, row)
-    totals, after, before = count_open(connection, View(parent, own.key))
+    totals, after, before = count_open(connection, View(parent, own.key), own)
     save_runs(connection, before, after)
-    row |= {
+    row = row | {
         "status": str(RevisionStatus.COMMITTED),
         "number": parent + 1,
         "parent": parent or None,
@@ -178,6 +173,18 @@ def brought(connection: Connection, row: Row) -> tuple[dict[str, float], Own]:
         for step in connection.execute(steps).scalars()
     )
     return contents, Own(own.key, ranges)
+
+
+def with_rows(
+    contents: Mapping[str, float], own: Own, table: Table, rows: Sequence[Row]
+) -> tuple[dict[str, float], Own]:
+    """What a revision has `brought` with these rows of a table, which have the newest keys."""
+    if not rows:
+        return dict(contents), own
+    first, _ = own.ranges.get(table.name, (rows[0]["key"], 0))
+    ranges = {**own.ranges, table.name: (first, rows[-1]["key"])}
+    more = contents[table.name] + len(rows)
+    return {**contents, table.name: more}, Own(own.key, ranges)
 
 
 def changes_layout(contents: Mapping[str, float]) -> bool:

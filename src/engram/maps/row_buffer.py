@@ -74,6 +74,7 @@ class RowBuffer:
     Attributes:
         rows: by table, in order of writing, but for edges, words and attempts.
         written_attempts: number of attempts that the revision has already, by key of the session.
+        scattered: keys of the sessions whose attempts several checkpoints wrote.
         size_bytes: approximate size of the buffer in memory.
     """
 
@@ -82,6 +83,7 @@ class RowBuffer:
         self._revision_key = revision_key
         self._attempts: dict[int, list[Attempts]] = defaultdict(list)
         self.written_attempts: dict[int, int] = defaultdict(int)
+        self.scattered: set[int] = set()
         self.clear()
 
     def clear(self) -> None:
@@ -90,6 +92,8 @@ class RowBuffer:
         self._edges: dict[tuple[int, int, str], Row] = {}
         self._words: dict[int, Row] = {}
         for session, tables in self._attempts.items():
+            if self.written_attempts[session]:
+                self.scattered.add(session)
             self.written_attempts[session] += sum(map(len, tables))
         self._attempts.clear()
         self.size_bytes = 0
@@ -143,7 +147,9 @@ class RowBuffer:
 
     def repack_attempts(self, connection: Connection, own: Own) -> None:
         """Packs attempts of all checkpoints together, so that the file does not depend on them."""
-        written = own.rows(attempts)
+        if not self.scattered:
+            return
+        written = own.rows(attempts) & attempts.c.session.in_(self.scattered)
         found = connection.execute(select(attempts).where(written).order_by(attempts.c.key))
         bodies: dict[int, list[Row]] = defaultdict(list)
         for row in verified(attempts, found):

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Table
+from sqlalchemy import Connection, Table
 
 from engram.errors import IncompatibleError, InputError, RevisionError
 from engram.frontend.blobs import blob_hash, content_digest, encode_landmarks, encode_thumbnail
@@ -33,6 +33,7 @@ from engram.graph.paths import Attempts
 from engram.graph.placing import DEFAULT_CONFIG as PLACING
 from engram.graph.placing import PlacingConfig
 from engram.maps import reading
+from engram.maps.columns import Visible
 from engram.maps.frame_reader import FrameReader
 from engram.maps.hiding import check_same_node, check_same_session, hidden_row, hidden_rows
 from engram.maps.marks import mark_row
@@ -45,6 +46,7 @@ from engram.maps.revisions import (
     commit_revision,
     open_sessions,
     revision_row,
+    with_rows,
 )
 from engram.maps.row_buffer import RowBuffer
 from engram.maps.rows import check_edge, checked_int, session_row, to_json, transform_bytes
@@ -60,6 +62,7 @@ from engram.maps.schema import (
     omitted_landmarks,
     path_entries,
     paths,
+    placements,
     sessions,
     statistics,
     vocabularies,
@@ -140,7 +143,9 @@ class RevisionWriter:
         self._known = References(database, keys, view, self._rows)
         if drive is not None and stored is not None:
             key, *_ = self._known.sessions[drive.session.id.bytes]
-            self._rows.written_attempts[key] = stored.attempts
+            if stored.attempts:
+                self._rows.written_attempts[key] = stored.attempts
+                self._rows.scattered.add(key)
         self._frames = frame_reader
         self._view = view
         self._revision_key = view.own
@@ -149,10 +154,11 @@ class RevisionWriter:
         self._committed_ns = committed_ns
         self._places = places
         self._ended = False
+        self._descriptor = self._known.descriptor
         with database.reading() as connection:
-            self._descriptor = reading.descriptor_of(connection, view)
+            (seen,) = Visible.of(connection, view)
             self._hidden = {
-                table: hidden_rows(connection, view, table) for table in (sessions, nodes, paths)
+                table: hidden_rows(connection, seen, table) for table in (sessions, nodes, paths)
             }
             self._interrupted = open_sessions(connection)
         self._omitted: set[bytes] = set()
@@ -480,24 +486,24 @@ class RevisionWriter:
             StorageFullError: as `checkpoint`.
         """
         self.checkpoint()
-        with self._database.reading() as connection:
-            row = revision_row(connection, self._revision_key, self._status)
-            contents, own = brought(connection, row)
-        if changes_layout(contents):
-            for one in self._places(contents, own, placing):
-                self.add_mark(one)
-            self.checkpoint()
         with self._database.writing() as connection:
-            if self.resumable:
-                self._rows.repack_attempts(connection, own_rows(row))
-            revision = commit_revision(
-                connection,
-                self._revision_key,
-                was=self._status,
-                committed_ns=self._committed_ns,
-            )
+            row = revision_row(connection, self._revision_key, self._status)
+            self._rows.repack_attempts(connection, own_rows(row))
+            contents, own = brought(connection, row)
+            if changes_layout(contents):
+                self._write_places(connection, self._places(contents, own, placing))
+                contents, own = with_rows(contents, own, placements, self._rows.rows[placements])
+            revision = commit_revision(connection, row, contents, own, self._committed_ns)
+        self._clear()
         self._end()
         return revision
+
+    def _write_places(self, connection: Connection, found: Sequence[Mark]) -> None:
+        """Writes where nodes lie; if the transaction fails, the next checkpoint writes them."""
+        for one in found:
+            table, values = mark_row(one, lambda node: self._known.node(node, "place"))
+            self._rows.new(table, **values)
+        self._rows.write(connection)
 
     def leave(self) -> None:
         """Leaves a drive for `check --seal`: it counts as interrupted on purpose."""
@@ -551,6 +557,7 @@ class RevisionWriter:
         key = self._shown_again(paths, path.bytes)
         if key is None:
             key = self._rows.new(paths, uuid=path.bytes, session=session_key, partial=int(partial))
+            self._known.begin_path(key)
         self._known.paths[path.bytes] = key
 
     def _insert_node(self, stored: StoredNode) -> int:
