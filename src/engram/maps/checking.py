@@ -212,7 +212,7 @@ class _Checking:
             return False
         for column in _REFERENCES.keys() & found.values.keys():
             values = found[column].tolist()
-            self._learn(_REFERENCES[column], values)
+            self.learn(_REFERENCES[column], values)
             for owner, value in {*zip(owners, values, strict=True)}:
                 revision = self.revision_rows[owner]
                 if self.reference_problem(revision, _REFERENCES[column], value):
@@ -227,7 +227,7 @@ class _Checking:
     def _check_rows(self, table: Table, part: list[tuple[Any, ...]]) -> None:
         names = [column.name for column in table.columns]
         for column in _REFERENCES.keys() & set(names):
-            self._learn(_REFERENCES[column], [values[names.index(column)] for values in part])
+            self.learn(_REFERENCES[column], [values[names.index(column)] for values in part])
         for values in part:
             try:
                 (row,) = verified(table, [values])
@@ -262,7 +262,7 @@ class _Checking:
             last,
         )
 
-    def _learn(self, table: Table, keys: Iterable[Any]) -> None:
+    def learn(self, table: Table, keys: Iterable[Any]) -> None:
         """Looks up rows, for as long as the same part is checked; unsound ones count as missing."""
         known = self.known[table]
         wanted = {key for key in keys if isinstance(key, int)} - known.keys()
@@ -283,7 +283,7 @@ class _Checking:
 
     def _named(self, table: Table, key: int, otherwise: str) -> str:
         """The UUID of a row; other words if there is no sound one."""
-        self._learn(table, [key])
+        self.learn(table, [key])
         row = self.known[table].get(key)
         return otherwise if row is None else describe(table, list(row.values()))
 
@@ -510,7 +510,7 @@ def _check_attempts(checking: _Checking, row: Row) -> None:
         return  # reported already
     for name in ("reference", "node"):
         keys = np.unique(getattr(table, name)).tolist()
-        checking._learn(nodes, keys)
+        checking.learn(nodes, keys)
         for key in keys:
             fact = checking.reference_problem(revision, nodes, key)
             if fact:
@@ -548,7 +548,7 @@ def _check_vocabulary(checking: _Checking, row: Row) -> None:
 def _check_hidden(checking: _Checking, row: Row) -> None:
     table = metadata.tables.get(row["record"])
     if table in _HIDEABLE:
-        checking._learn(table, [row["target"]])
+        checking.learn(table, [row["target"]])
     if table not in _HIDEABLE or row["target"] not in checking.known[table]:
         raise MapCorruptError(f"hides row {row['target']} of {row['record']}, which is missing")
 

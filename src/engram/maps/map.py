@@ -519,6 +519,10 @@ class Map:
                 size_bytes=self._database.size_bytes(),
             )
 
+    def session_sizes(self) -> dict[SessionId, tuple[int, int]]:
+        """Number of nodes and of path entries of each session."""
+        return self._read(reading.session_sizes)
+
     def statistics(self) -> dict[str, dict[str, Any]]:
         """The newest value of each statistic of the map, by name."""
         return self._read(reading.load_statistics)

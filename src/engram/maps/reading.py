@@ -99,6 +99,27 @@ def load_sessions(connection: Connection, view: View) -> tuple[Session, ...]:
     return tuple(sessions_by_key(connection, view, load_cameras(connection)).values())
 
 
+def session_sizes(connection: Connection, view: View) -> dict[SessionId, tuple[int, int]]:
+    """Number of nodes and of path entries of each session."""
+    known = sessions_by_key(connection, view, load_cameras(connection))
+    own = view.select(nodes).with_only_columns(nodes.c.session, func.count())
+    saved = _pairs(connection, own.group_by(nodes.c.session))
+    places = view.select(path_entries).with_only_columns(
+        path_entries.c.path, func.count(path_entries.c.sequence.distinct())
+    )
+    passed = _pairs(connection, places.group_by(path_entries.c.path))
+    owners = view.select(paths).with_only_columns(paths.c.session, paths.c.key)
+    path_of = _pairs(connection, owners)
+    return {
+        one.id: (saved.get(key, 0), passed.get(path_of.get(key, 0), 0))
+        for key, one in known.items()
+    }
+
+
+def _pairs(connection: Connection, query: Select[Any]) -> dict[int, int]:
+    return dict(map(tuple, connection.execute(query.order_by(None))))
+
+
 def load_amendments(connection: Connection, view: View) -> tuple[Amendment, ...]:
     """Amendments of the visible sessions; the last of contradicting ones counts."""
     known = sessions_by_key(connection, view, load_cameras(connection))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 from engram.errors import InputError
 from engram.graph.clock import hour_of_day, zone_note
-from engram.graph.model import Amendable, Node, path_id
+from engram.graph.model import Amendable, Node
 from engram.maps.history import stamp_text
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
@@ -52,11 +51,8 @@ def describe_map(path: Path, at: int | str | None = None) -> dict[str, Any]:
 def list_sessions(path: Path, at: int | str | None = None) -> list[dict[str, Any]]:
     """The sessions of a map in order of arrival, for ``engram info --sessions``."""
     with Map.open(path, at=at) as store:
-        contents = store.load()
-        frontends = store.frontends
+        sessions, sizes, frontends = store.sessions, store.session_sizes(), store.frontends
         amended = {(one.session, str(one.what)) for one in store.amendments}
-    nodes = Counter(node.session for node in contents.nodes)
-    entries = Counter(entry.path for entry in contents.path_entries)
     return [
         {
             "session": str(one.id),
@@ -69,12 +65,12 @@ def list_sessions(path: Path, at: int | str | None = None) -> list[dict[str, Any
             "zone": one.zone,
             "hour": hour_of_day(one, one.start_ns),
             "note": zone_note(one),
-            "nodes": nodes[one.id],
-            "path_entries": entries[path_id(one.id)],
+            "nodes": sizes[one.id][0],
+            "path_entries": sizes[one.id][1],
             "descriptor": str(frontends[one.id][0]),
             "amended": sorted(what for session, what in amended if session == one.id),
         }
-        for one in contents.sessions
+        for one in sessions.values()
     ]
 
 

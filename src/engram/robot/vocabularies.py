@@ -194,7 +194,7 @@ def _frames(source: Path, kind: DescriptorKind | None) -> list[Frame]:
     """The frames of a map's nodes, or the usable frames of a drive."""
     if source.suffix == MAP_SUFFIX:
         with Map.open(source) as store:
-            return [store.frames.frame(node.id) for node in store.load().nodes]
+            return [store.frames.frame(node) for node in store.read_graph().ids(0) if node]
     sequence: DriveSequence = open_drive(source)
     settings = Settings().for_descriptor(kind)
     frontend = Frontend(settings.frontend)
