@@ -307,7 +307,7 @@ def test_the_first_success_ends_the_frame_where_the_papers_settings_say_so(stree
 def test_a_drive_attempts_as_its_paper_says(street, paper):
     """In light that no node has, nothing ends a frame but its budget."""
     published, ours = (Effort().over(read_settings(one)) for one in (Path(paper), None))
-    of_robot = {"relocaliser": "fabmap", "threads": None}
+    of_robot = {"relocaliser": "fabmap", "threads": None, "memory_bytes": None}
     assert published == {"ranking": "path", "lanes": 2, "rounds": 1, **of_robot}
     assert ours == {"ranking": "recall", "lanes": 2, "rounds": 2, **of_robot}
     live = drive(WORLD, ROAD[-3:], 7, start_ns=10**15, seed=3)

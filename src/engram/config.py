@@ -14,6 +14,7 @@ import json
 import math
 import operator
 import os
+import re
 import tomllib
 import types
 import typing
@@ -35,6 +36,20 @@ class Public:
 
 
 PUBLIC = Public()
+
+_SIZE = re.compile(r"(?P<number>\d+(\.\d+)?)\s*(?P<unit>[kMGT]?i?B?)", re.ASCII)
+_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
+_UNITS |= {f"{name}i": 2 ** (10 * power) for power, name in enumerate("kMGT", start=1)}
+
+
+def bytes_of(text: str) -> int | None:
+    """Bytes of "200MB", "1.5 GiB" or "4096"; None if the text is not a size."""
+    match = _SIZE.fullmatch(text.strip())
+    unit = match["unit"].removesuffix("B") if match else ""
+    if match is None or unit not in _UNITS:
+        return None
+    return int(float(match["number"]) * _UNITS[unit])
+
 
 # Engram's own longest, all settings with what they mean, has 35,000 characters.
 _MOST_CHARACTERS = 400_000

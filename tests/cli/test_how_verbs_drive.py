@@ -70,6 +70,13 @@ def test_the_settings_rank_and_attempt_unless_options_do(
     assert (seen[-1].ranking, seen[-1].lanes, seen[-1].rounds) == ("path", 1, 1)
     engram(*words, "--set", "drive.relocaliser=none")
     assert seen[-1].relocaliser is None
+    assert seen[-1].memory_bytes is None
+    engram(*words, "--set", "drive.memory=1.5GiB")
+    assert seen[-1].memory_bytes == 3 * 2**29
+    assert "drive.memory is 'much'" in engram(*words, "--set", "drive.memory=much").err
+    if verb in {"localise", "live", "map"}:
+        engram(*words, "--memory", "200MB")
+        assert seen[-1].memory_bytes == 200_000_000
     if verb in {"localise", "live", "lab try"}:
         engram(*words, "--config", "linegar2015", "--ranking", "distance")
         assert (seen[-1].ranking, seen[-1].lanes, seen[-1].rounds) == ("distance", 2, 1)

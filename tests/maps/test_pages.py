@@ -11,6 +11,7 @@ import pytest
 
 from engram.frontend.frame import BRIEF
 from engram.geometry.se3 import SE3
+from engram.graph import paths as path_memories
 from engram.graph.basin import MatchBasin
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
@@ -255,6 +256,41 @@ def test_what_is_added_stays(town: Path) -> None:
         assert memory.on_paths(
             [path_id(made.id)], np.array([0, len(paged) - 5], np.int32)
         ).tolist() == [[False, True]]
+
+
+def test_paths_that_were_dropped_are_read_again(
+    town: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(path_memories, "_MOST_BYTES", 0)
+    made = session("new", 5)
+    with Map.open(town, at=4) as opened:
+        graph = opened.read_graph()
+        dropped, kept = (PathMemory(graph, pages=opened.pages) for _ in range(2))
+        nodes = np.array([graph.index(one) for one in opened.graph.ids(0, 300) if one], np.int32)
+        for memory in (dropped, kept):
+            memory.add(
+                PathEntry(path_id(made.id), 0, graph.node(int(nodes[5])).id, PathEntryKind.SAVED, 1)
+            )
+        for some in (slice(0, 70), slice(100, 200), slice(0, 70)):
+            dropped.trim()
+            np.testing.assert_array_equal(
+                dropped.co_occurrence(nodes[some], nodes[::3]),
+                kept.co_occurrence(nodes[some], nodes[::3]),
+            )
+        dropped.trim()
+        assert dropped._bits.sum() > 0  # of the new entry alone
+        assert dropped.on_paths([path_id(made.id)], nodes[4:7]).tolist() == [[False, True, False]]
+
+
+def test_a_map_keeps_within_the_memory_that_it_is_given(town: Path) -> None:
+    with Map.open(town) as opened:
+        ids = [one.id for one in opened.graph.nodes[:50]]
+        for one in ids:
+            opened.frames.frame(one)
+        held = opened.frames._cached_bytes
+        opened.bound_memory(held)
+        assert held / 2 < opened.frames._cached_bytes <= held * 5 / 6
+        assert opened.read_graph()._budget_bytes == held // 6
 
 
 def _changed(one: Edge) -> Edge:

@@ -87,6 +87,7 @@ def map_(
     *,
     drive: options.Drive,
     features: options.Features = None,
+    effort: options.Effort,
     force: Annotated[
         bool, typer.Option("--force", help="Map the drive even if the doctor finds it unfit.")
     ] = False,
@@ -114,7 +115,7 @@ def map_(
     from engram.robot.settings import RobotOptions
     from engram.viewing.viewer import viewer_for
 
-    asked = RobotOptions(**options.Effort().over(given), force=force)
+    asked = RobotOptions(**effort.over(given), force=force)
     resolved = given.of_robot(features)
     features = features or _asked_kind(resolved)
     with losses_told(sequence):

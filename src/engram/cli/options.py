@@ -195,14 +195,26 @@ class Effort:
         ),
     ] = None
 
+    memory: Annotated[
+        str | None,
+        typer.Option(
+            "--memory",
+            metavar="SIZE",
+            help="Most memory of the map's landmarks and graph: 200MB [default: 300MB].",
+        ),
+    ] = None
+
     def over(self, settings: AllSettings) -> dict[str, Any]:
         """How a robot drives: as given, else as in the settings."""
         drive = settings.drive
+        if self.memory is not None:
+            drive = dataclasses.replace(drive, memory=self.memory)
         return {
             "ranking": self.ranking or drive.ranking,
             "lanes": drive.lanes,
             "rounds": drive.rounds,
             "threads": drive.threads,
+            "memory_bytes": drive.memory_bytes,
             "relocaliser": None if drive.relocaliser == "none" else drive.relocaliser,
         }
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from engram.config import PUBLIC, check_bounds, from_dict, read_toml, to_dict
+from engram.config import PUBLIC, bytes_of, check_bounds, from_dict, read_toml, to_dict
 from engram.drive_options import DriveOptions
 from engram.errors import ConfigError
 from engram.fleet.settings import BuildSettings, DownloadSettings, MergeSettings
@@ -49,6 +49,17 @@ class DriveSettings(DriveOptions):
         ]
         | None
     ) = None
+    memory: (
+        Annotated[
+            str,
+            Meta(
+                description="largest memory of the map's landmarks and graph, 200MB; none: 300 MB. "
+                "A crowded place may take more",
+            ),
+            PUBLIC,
+        ]
+        | None
+    ) = None
     relocaliser: Annotated[
         str,
         Meta(description="finds a lost robot: fabmap, signature (net), exhaustive, none"),
@@ -57,6 +68,15 @@ class DriveSettings(DriveOptions):
 
     def __post_init__(self) -> None:
         check_bounds(self)
+        if self.memory is not None and not self.memory_bytes:
+            raise ConfigError(
+                f"drive.memory is {self.memory!r}, must be a size such as 200MB, 1.5GiB or 4096"
+            )
+
+    @property
+    def memory_bytes(self) -> int | None:
+        """`memory` in bytes; None if it is not given."""
+        return None if self.memory is None else bytes_of(self.memory)
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,8 @@ ENTRY_KINDS = tuple(PathEntryKind)
 ALL_KINDS = frozenset(PathEntryKind)
 # [L15 §IV]'s text records matches only (method §4).
 MATCHES_ONLY = frozenset({PathEntryKind.MATCHED, PathEntryKind.REPLAYED})
+# Of bits that are read by pages: above it `trim` drops them.
+_MOST_BYTES = 16 * 2**20
 
 
 class PathPages(Protocol):
@@ -137,6 +139,17 @@ class PathMemory:
                 self._observed.add(node, number)
         self._make_room()
         self._set_bits(np.array(nodes, np.int64), np.array(numbers, np.int64))
+
+    def trim(self) -> None:
+        """Drops what was read by pages if it takes too much memory; call it between frames."""
+        if len(self._read) * PAGE * self._bits.shape[1] * 8 <= _MOST_BYTES:
+            return
+        self._read.clear()
+        self._bits, self._view = np.zeros(self._bits.shape, np.uint64), None
+        for number, entries in enumerate(self._entries):
+            counted = [one.node for one in entries if one.kind in self.kinds]
+            nodes = np.array([self._graph.index(one) for one in counted], np.int64)
+            self._set_bits(nodes, np.full(len(nodes), number))
 
     def on_paths(self, paths: Sequence[PathId], nodes: NDArray[np.int32]) -> NDArray[np.bool_]:
         """(P, N) bool: whether each path holds each node; unknown paths hold none.

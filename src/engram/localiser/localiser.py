@@ -353,6 +353,7 @@ class Localiser:
         """
         clock = clock or StageClock()
         self._graph.trim()
+        self._paths.trim()
         self._new_damaged, self._near, self._looked_up, self._beyond = (), None, False, []
         self._history.begin_frame(self._driven_m)
         self._fixes.begin_frame(self._motion.odometry.inliers)

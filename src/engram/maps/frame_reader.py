@@ -171,6 +171,12 @@ class FrameReader:
         shown = {row["target"] for row in rows if row["record"] == nodes.name}
         self._hidden = self._hidden - shown
 
+    def bound_cache(self, size_bytes: int) -> None:
+        """Changes the largest size of the decoded frames."""
+        with self._lock:
+            self._cache_bytes = size_bytes
+            self._drop_oldest()
+
     def forget(self) -> None:
         """Drops all held and cached frames."""
         with self._lock:
@@ -247,9 +253,12 @@ class FrameReader:
                 return
             self._cache[node] = frame
             self._cached_bytes += _size_bytes(frame)
-            while self._cached_bytes > self._cache_bytes and len(self._cache) > 1:
-                _, oldest = self._cache.popitem(last=False)
-                self._cached_bytes -= _size_bytes(oldest)
+            self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        while self._cached_bytes > self._cache_bytes and len(self._cache) > 1:
+            _, oldest = self._cache.popitem(last=False)
+            self._cached_bytes -= _size_bytes(oldest)
 
     def _read_ahead(self) -> None:
         while True:

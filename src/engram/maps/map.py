@@ -33,7 +33,7 @@ from engram.graph.model import (
     Session,
     SessionId,
 )
-from engram.graph.pages import PagedGraph
+from engram.graph.pages import DEFAULT_BUDGET_BYTES, PagedGraph
 from engram.graph.paths import Attempts, PathMemory
 from engram.graph.placing import PlacingConfig
 from engram.keywords import keywords
@@ -252,6 +252,7 @@ class Map:
         self._contents_lock = threading.RLock()
         self._contents: _Contents | None = None
         self._derived: dict[tuple[object, ...], Any] = {}
+        self._page_bytes = DEFAULT_BUDGET_BYTES
         self._writing: RevisionWriter | None = None
         self._laid_out: dict[NodeId, SE3] | None = None  # once the open revision is committed
 
@@ -354,7 +355,15 @@ class Map:
 
         Dense indices are in the order of saving, and the same in each such graph of this revision.
         """
-        return PagedGraph(self.pages)
+        return PagedGraph(self.pages, self._page_bytes)
+
+    def bound_memory(self, size_bytes: int) -> None:
+        """Bounds what decoded frames, and each graph read by pages from now on, take together.
+
+        A sixth is for the graph, as by default.
+        """
+        self._page_bytes = size_bytes // 6
+        self.frames.bound_cache(size_bytes - self._page_bytes)
 
     @property
     def pages(self) -> MapPages:

@@ -254,6 +254,8 @@ class MapPages:
     ) -> NDArray[np.float64]:
         """(2, n) successes, and weights of failures, of nodes with these keys (n,)."""
         numbers, which = np.unique(page_of(keys), return_inverse=True)
+        if len(known) > _MOST_PAGES:  # they are asked for while a robot is near
+            known.clear()
         for page in numbers.tolist():
             if page not in known:
                 known[page] = self._fared_on(basin, page)
@@ -349,6 +351,7 @@ class MapPages:
 
 
 _MANY = 4096
+_MOST_PAGES = 64
 _FIRST: BindParameter[int] = bindparam("first")
 _LAST: BindParameter[int] = bindparam("last")
 _NODES = select(*nodes.columns).where(nodes.c.key.between(_FIRST, _LAST))

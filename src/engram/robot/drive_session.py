@@ -76,7 +76,10 @@ class RobotSetup:
         self, opened: Map, *, maps: bool = False, remembers: bool = False
     ) -> Localiser:
         """The localiser of the drive."""
-        options, graph = self.options, opened.read_graph()
+        options = self.options
+        if options.memory_bytes is not None:
+            opened.bound_memory(options.memory_bytes)
+        graph = opened.read_graph()
         finder = suggesting(opened, self.fix, self.settings, options.relocaliser, graph)
         return localiser_in(
             opened,

@@ -79,6 +79,7 @@ class RobotOptions:
         relocaliser: one of `relocaliser_names()`, for a lost robot; None for none.
         threads: most threads of the robot, its caller's included; None for one per lane and per
             background task. Without a deadline the results are the same with any number.
+        memory_bytes: largest memory of the map's landmarks and graph; None for 300 MB.
         author: author of revisions; None for the robot.
         force: whether a drive with a fatal finding of the doctor is mapped all the same.
     """
@@ -89,6 +90,7 @@ class RobotOptions:
     deadline_ms: float | None = None
     relocaliser: str | None = "fabmap"
     threads: int | None = None
+    memory_bytes: int | None = None
     author: str | None = None
     force: bool = False
 

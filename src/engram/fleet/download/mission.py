@@ -9,14 +9,11 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from engram.config import PUBLIC, check_bounds
+from engram.config import PUBLIC, bytes_of, check_bounds
 from engram.errors import ConfigError
 
 _CLOCK = re.compile(r"(?P<hour>\d{1,2})(:(?P<minute>\d{2}))?", re.ASCII)
-_SIZE = re.compile(r"(?P<number>\d+(\.\d+)?)\s*(?P<unit>[kMGT]?i?B?)", re.ASCII)
 _PERCENT = re.compile(r"(?P<number>\d+(\.\d+)?)\s*%", re.ASCII)
-_UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
-_UNITS |= {f"{name}i": 2 ** (10 * power) for power, name in enumerate("kMGT", start=1)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,14 +131,12 @@ def budget_from_text(text: str | None) -> tuple[int | None, float | None]:
         return None, None
     if share := _PERCENT.fullmatch(text.strip()):
         return None, float(share["number"])
-    match = _SIZE.fullmatch(text.strip())
-    unit = match["unit"].removesuffix("B") if match else ""
-    if match is None or unit not in _UNITS:
+    if (size := bytes_of(text)) is None:
         raise ConfigError(
             f"budget is {text!r}, must be a size such as 200MB, 1.5GiB or 4096, or a share of "
             "everything such as 25%"
         )
-    return int(float(match["number"]) * _UNITS[unit]), None
+    return size, None
 
 
 def _check_day(text: str) -> None:
