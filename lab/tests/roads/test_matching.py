@@ -13,12 +13,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.core.textures import shifted_pair
 
 from engram.errors import ConfigError
+from engram.frontend.frame import StereoPair
+from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram_lab.roads.distance import load_clip
 from engram_lab.roads.matching import Answer, Answers, Mapped, distinct, resected
-from engram_lab.roads.odometry import tracked
+from engram_lab.roads.odometry import motion, tracked
+from engram_lab.roads.seasons import shares
 from engram_lab.roads.xfeat import _convolved, mutual, read_weights
 from engram_lab.town.drive import robot_named
 from engram_lab.town.rendering import Visit, at
@@ -99,6 +103,25 @@ def test_tracking_gives_up_what_does_not_come_back():
     there, found = tracked(image, moved, pixels)
     assert found.tolist() == [True, True, False]
     np.testing.assert_allclose((there - pixels)[:2], [[3, 0]] * 2, atol=0.1)
+
+
+def test_a_camera_at_rest_has_not_moved_and_a_black_one_says_nothing():
+    camera = StereoCamera(260.0, 260.0, 160.0, 120.0, 0.2, 320, 240)
+    left, right = shifted_pair(240, 320, 12.25, seed=1, noise=2.0)
+    pair = StereoPair(1, left, right, camera)
+    found = motion(pair, pair)
+    assert found is not None
+    assert found.distance_m < 1e-3
+    black = StereoPair(2, np.zeros_like(left), np.zeros_like(right), camera)
+    assert motion(black, pair) is None
+
+
+def test_shares_are_compared_over_the_same_places():
+    near, base = np.arange(40) % 4 > 0, np.arange(40) % 10 > 0
+    change, deviation = shares(near, base)
+    assert change == pytest.approx(-15)
+    paired = 100 * np.std(near.astype(float) - base) / np.sqrt(40)
+    assert deviation == pytest.approx(paired, rel=0.1)
 
 
 class _Asked(Mapped):
