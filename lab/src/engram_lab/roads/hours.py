@@ -22,7 +22,7 @@ from engram_lab.roads.matching import SIFT, Answer, Answers, Mapped, learnt
 from engram_lab.roads.seasons import JUDGED
 from engram_lab.town.rendering import Places, Visit, at
 
-_LOOP_M, _EVERY_M = 300.0, 15.0
+_LOOP_M, _EVERY_M = 150.0, 15.0
 _SERVES = 20  # inliers of a frame that a map serves
 
 _NOON = Visit("noon", at(8, 7, 12.0), "clear", 37)

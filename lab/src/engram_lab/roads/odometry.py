@@ -27,7 +27,7 @@ from engram_lab.roads.seasons import JUDGED
 from engram_lab.town.campaigns import campaign_named
 from engram_lab.town.session import SimulatedDrive
 
-_LOOP_M = 300.0
+_LOOP_M = 150.0
 _CORNERS, _QUALITY, _APART_PX = 800, 0.003, 8
 _BACK_PX = 1.0  # between a corner and where tracking back ends
 _DAY = datetime(2025, 7, 17, 11, tzinfo=UTC)
@@ -43,7 +43,7 @@ class Course:
     """One drive's odometry.
 
     Attributes:
-        drift: median error over 100 and 200 m, as a share of these.
+        drift: median error over 100 m, as a share of it.
         lost: share of the steps without a motion of their own; the one before stands for it.
     """
 
