@@ -88,7 +88,7 @@ class Weather:
         fog_per_m: extinction of the air.
         rain_mm_h: that falls; `changes` makes it come and go.
         wet: film of water on the ground, 0…1.
-        snow: how much lies, 0…1.
+        snow: how much lies; half of open ground is covered from 0.3, all of it from 0.5.
     """
 
     cloud: float = 0.0
@@ -109,8 +109,8 @@ WEATHERS: dict[str, Weather] = {
     "rain": Weather(cloud=1.0, changes=0.2, fog_per_m=0.0015, rain_mm_h=4.0, wet=1.0),
     "showers": Weather(cloud=0.75, changes=0.5, fog_per_m=0.001, rain_mm_h=2.0, wet=0.7),
     "damp": Weather(cloud=0.9, changes=0.2, fog_per_m=0.001, wet=0.7),
-    "snow": Weather(cloud=1.0, fog_per_m=0.001, snow=0.5),
-    "thaw": Weather(cloud=0.6, changes=0.3, wet=0.6, snow=0.45),
+    "snow": Weather(cloud=1.0, fog_per_m=0.001, snow=0.3),
+    "thaw": Weather(cloud=0.6, changes=0.3, wet=0.6, snow=0.15),
 }
 
 
