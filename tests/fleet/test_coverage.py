@@ -164,8 +164,9 @@ def test_elsewhere_asks_for_nothing(stock):
     """Every drive began at 0 m of the street: the distance driven is the place."""
     driven_m = np.array([node.driven_m for node in stock.nodes])
     where, far = driven_m < 5, driven_m > 20
-    near = Coverage(stock, Demand.of(stock, DownloadOptions(), where))
     anywhere = coverage_for(stock, DownloadOptions())
+    stock.area = where
+    near = coverage_for(stock, DownloadOptions())
     assert 0 < near.demand.total < anywhere.demand.total / 3
     assert expected_missed(near, far) == 1.0
     assert expected_missed(near, where | far) == expected_missed(near, where) < 0.9

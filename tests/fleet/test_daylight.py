@@ -26,7 +26,8 @@ def session(number: int, when: datetime, **about) -> Session:
 
 
 def stock(*sessions: Session) -> SimpleNamespace:
-    return SimpleNamespace(sessions=list(sessions), contents=SimpleNamespace(cameras=CAMERAS))
+    store = SimpleNamespace(sessions={one.id: one for one in sessions})
+    return SimpleNamespace(sessions=list(sessions), cameras=CAMERAS, store=store)
 
 
 JUNE_EVENING = session(1, datetime(2026, 6, 20, 17, 12, tzinfo=UTC))

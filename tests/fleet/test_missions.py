@@ -22,7 +22,7 @@ from engram.fleet.download.coverage import (
 from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Stock
-from engram.fleet.download.selections import SELECTIONS, along_route, mission_area
+from engram.fleet.download.selections import SELECTIONS
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 
@@ -92,8 +92,9 @@ def test_every_mission_is_as_connected_as_the_fleet_map_and_says_what_it_did(
         return
     report = download(centre, out, options)
     labels = dict(zip(stock.node_ids, stock.graph.components().tolist(), strict=True))
-    area = mission_area(stock, options)
-    allowed = {stock.node_ids[at] for at in np.flatnonzero(area)}
+    with Map.open(centre) as store:
+        around = Stock(store, options)
+    allowed = {around.node_ids[at] for at in np.flatnonzero(around.area)}
     with Map.open(out) as sent:
         nodes = {node.id for node in sent.load().nodes}
         components = int(sent.graph.components().max()) + 1
@@ -128,8 +129,10 @@ def test_widening_stops_at_the_nearest_hours(stock):
 def test_without_any_hour_near_everything_of_the_area_goes_along(stock, monkeypatch):
     monkeypatch.setattr("engram.fleet.download.selections._WIDEST_MIN", 100.0)
     options = options_of(stock, "tod", "route", WITHOUT)
-    found = SELECTIONS["tod"](stock, options)
-    assert (found.sent == along_route(stock, options.route, 2.0)).all()
+    around = Stock(stock.store, options)
+    found = SELECTIONS["tod"](around, options)
+    assert 0 < found.sent.sum() < len(around)
+    assert (found.sent == around.area).all()
     assert "all hours are sent" in found.why["widened"]
 
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+from collections.abc import Callable
 from contextlib import suppress
 
+import numpy as np
 import pytest
 from sqlalchemy import Table
 
 from engram.errors import EngramError, MapCorruptError
+from engram.graph.model import path_id
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.maps.rows import sealed
@@ -26,7 +29,7 @@ from engram.maps.schema import (
     tags,
 )
 
-from .maps import begin, session, write_drive
+from .maps import begin, node, session, write_drive
 
 _COLUMNS = (
     '"key" INTEGER NOT NULL, revision INTEGER NOT NULL, name TEXT NOT NULL, body TEXT NOT NULL'
@@ -114,6 +117,29 @@ STRANGE_ROWS = [
 ]
 
 
+def questions(store: Map) -> list[Callable[[], object]]:
+    """What a merge and a download look up."""
+    found, nodes = store.lookups, [node(session("robot-1"), at).id for at in range(2)]
+    some = [session("robot-1").id, session("robot-2").id]
+    return [
+        lambda: found.nodes(nodes),
+        lambda: found.omissions(nodes),
+        lambda: found.landmark_hashes(nodes),
+        lambda: found.blob_sizes(nodes),
+        lambda: found.placements(nodes),
+        lambda: found.edges(nodes),
+        lambda: [found.entries(path_id(one)) for one in some],
+        lambda: found.entry_counts([path_id(one) for one in some]),
+        lambda: found.attempts(some),
+        found.last_stamps_ns,
+        found.runs,
+        lambda: found.moves(1, []),
+        lambda: store.pages.part(0, store.pages.end),
+        lambda: store.pages.entries(0, store.pages.end, dict(enumerate(nodes))),
+        lambda: store.pages.attempts(np.arange(2)),
+    ]
+
+
 @pytest.mark.parametrize(("table", "values"), STRANGE_ROWS)
 def test_what_is_wrong_under_a_right_checksum_is_refused_by_name(tmp_path, sound, table, values):
     path = shutil.copy(sound, tmp_path / "strange.engram")
@@ -126,7 +152,7 @@ def test_what_is_wrong_under_a_right_checksum_is_refused_by_name(tmp_path, sound
             store.content_hash,
             store.info,
             lambda: store.graph,
-            lambda: store.blob_sizes,
+            *questions(store),
             lambda: store.omissions,
             lambda: [store.frames.frame(node.id) for node in store.graph.nodes],
         ):
@@ -142,9 +168,9 @@ def test_a_value_of_another_type_than_its_column_is_refused(tmp_path, sound):
     kept = connection.execute("SELECT * FROM frames ORDER BY 1").fetchall()
     connection.execute("DROP TABLE frames")
     connection.execute(strict.replace("STRICT", ""))
-    for node, revision, _, thumbnail, checksum in kept:
+    for key, revision, _, thumbnail, checksum in kept:
         connection.execute(
-            "INSERT INTO frames VALUES (?, ?, 'text', ?, ?)", [node, revision, thumbnail, checksum]
+            "INSERT INTO frames VALUES (?, ?, 'text', ?, ?)", [key, revision, thumbnail, checksum]
         )
     connection.execute("PRAGMA writable_schema = ON")
     connection.execute("UPDATE sqlite_schema SET sql = ? WHERE name = 'frames'", [strict])

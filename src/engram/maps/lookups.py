@@ -6,7 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from sqlalchemy import Connection, Table, select
+from numpy.typing import NDArray
+from sqlalchemy import Connection, Table, func, select
 
 from engram.geometry.se3 import SE3
 from engram.graph.model import (
@@ -40,6 +41,7 @@ from engram.maps.runs import Runs
 from engram.maps.schema import (
     attempts,
     edges,
+    frames,
     nodes,
     omissions,
     omitted_landmarks,
@@ -51,7 +53,7 @@ from engram.maps.schema import (
 )
 from engram.maps.sqlite import SqliteDatabase
 from engram.maps.totals import own_rows, runs_of, state_at_head, totals_at
-from engram.maps.view import View, few
+from engram.maps.view import View, few, head
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +90,8 @@ class Lookups:
         with self._database.reading() as connection:
             rows = list(self._named(connection, nodes, some))
             records = node_records(connection, rows)
-        held = zip(records, rows, strict=True)
-        return {node.id: HeldNode(node, row["landmark_hash"], row["key"]) for node, row in held}
+            held = zip(records, rows, strict=True)
+            return {node.id: HeldNode(node, row["landmark_hash"], row["key"]) for node, row in held}
 
     def omissions(self, some: Iterable[NodeId]) -> dict[NodeId, Omission]:
         """Those of some nodes that the map omitted, each with its newest visible equivalent."""
@@ -101,12 +103,26 @@ class Lookups:
                 row["uuid"]: row["landmark_hash"]
                 for row in self._named(connection, omitted_landmarks, some)
             }
-        found = {}
-        for row in rows:
-            omitted = node_from_bytes(row["uuid"])
-            pose = transform_from_bytes(row["node_from_omitted"], f"omission {omitted}")
-            found[omitted] = Omission(omitted, ids[row["node"]], pose, hashes.get(row["uuid"]))
+            found = {}
+            for row in rows:
+                omitted = node_from_bytes(row["uuid"])
+                pose = transform_from_bytes(row["node_from_omitted"], f"omission {omitted}")
+                found[omitted] = Omission(omitted, ids[row["node"]], pose, hashes.get(row["uuid"]))
         return found
+
+    def known(self, some: Sequence[bytes]) -> frozenset[bytes]:
+        """The UUIDs whose nodes the map has or omitted, and which need not be handed in."""
+        with self._database.reading() as connection:
+            return frozenset(
+                uuid
+                for table in (nodes, omissions, omitted_landmarks)
+                for part in few(some)
+                for uuid in connection.execute(
+                    self._view.select(table)
+                    .with_only_columns(table.c.uuid)
+                    .where(table.c.uuid.in_(part))
+                ).scalars()
+            )
 
     def landmark_hashes(self, some: Iterable[NodeId]) -> dict[NodeId, bytes]:
         """Hash (16 bytes) of the landmarks of some nodes that the map has, or had omitted."""
@@ -127,16 +143,16 @@ class Lookups:
                 row["sequence"]: row for row in verified(path_entries, connection.execute(query))
             }
             ids = _node_ids(connection, {row["node"] for row in rows.values()})
-        return [
-            PathEntry(
-                path,
-                sequence,
-                ids[row["node"]],
-                member(PathEntryKind, row["kind"], "path_entries"),
-                row["stamp_ns"],
-            )
-            for sequence, row in sorted(rows.items())
-        ]
+            return [
+                PathEntry(
+                    path,
+                    sequence,
+                    ids[row["node"]],
+                    member(PathEntryKind, row["kind"], "path_entries"),
+                    row["stamp_ns"],
+                )
+                for sequence, row in sorted(rows.items())
+            ]
 
     def attempts(self, some: Sequence[SessionId]) -> Attempts:
         """Remembered attempts of some sessions.
@@ -172,7 +188,42 @@ class Lookups:
             }
             kept = counting(connection, self._view, list(rows.values()))
             ids = _node_ids(connection, {row[end] for row in kept for end in ("a", "b")})
-        return list(edges_from_rows(kept, [(ids[row["a"]], ids[row["b"]]) for row in kept]))
+            return list(edges_from_rows(kept, [(ids[row["a"]], ids[row["b"]]) for row in kept]))
+
+    def placements(self, some: Iterable[NodeId]) -> dict[NodeId, SE3]:
+        """``map_from_node`` of those of some nodes that have a place."""
+        with self._database.reading() as connection:
+            keys = {row["key"]: row["uuid"] for row in self._named(connection, nodes, some)}
+            found = places_of(connection, self._view, keys)
+            return {node_from_bytes(keys[key]): pose for key, pose in found.items()}
+
+    def blob_sizes(self, some: Sequence[NodeId]) -> NDArray[np.int64]:
+        """(N, 2) int64: bytes of each node's landmarks, and of its thumbnail; 0 without any."""
+        sizes: dict[bytes, tuple[int, int]] = {}
+        lengths = func.length(frames.c.landmarks), func.length(frames.c.thumbnail)
+        with self._database.reading() as connection:
+            for part in few([one.bytes for one in some]):
+                query = select(nodes.c.uuid, *lengths).join(frames, frames.c.node == nodes.c.key)
+                found = connection.execute(query.where(nodes.c.uuid.in_(part)))
+                sizes |= {uuid: (landmarks, picture or 0) for uuid, landmarks, picture in found}
+        found_sizes = [sizes.get(one.bytes, (0, 0)) for one in some]
+        return np.array(found_sizes, np.int64).reshape(-1, 2)
+
+    def entry_counts(self, some: Sequence[PathId]) -> dict[PathId, int]:
+        """Number of entries of those of some paths that have any."""
+        query = (
+            self._view.select(path_entries)
+            .with_only_columns(paths.c.uuid, func.count(path_entries.c.sequence.distinct()))
+            .join(paths, paths.c.key == path_entries.c.path)
+            .group_by(paths.c.uuid)
+            .order_by(None)
+        )
+        found: dict[PathId, int] = {}
+        with self._database.reading() as connection:
+            for part in few([one.bytes for one in some]):
+                counted = connection.execute(query.where(paths.c.uuid.in_(part)))
+                found |= {PathId(uuid_from_bytes(one, "a path")): count for one, count in counted}
+        return found
 
     def last_stamps_ns(self) -> dict[SessionId, int]:
         """Stamp of the node that each session saved last, of sessions that saved any."""
@@ -192,10 +243,12 @@ class Lookups:
             }
 
     def runs(self) -> Runs:
-        """Which nodes are connected as of the newest committed revision."""
+        """Which nodes are connected as of the newest committed revision that is visible."""
         with self._database.reading() as connection:
             _, runs = state_at_head(connection, self._view.at)
-            return runs_of(connection, View(self._view.at)) if runs is None else runs
+            if runs is None or head(connection) != self._view.at:
+                return runs_of(connection, View(self._view.at))
+            return runs
 
     def moves(self, number: int, goals: Sequence[Goal]) -> Moves:
         """What a revision moved in the map frame.
@@ -214,7 +267,7 @@ class Lookups:
             before, after = (places_of(connection, View(at), keys) for at in (number - 1, number))
             ids = _node_ids(connection, before.keys())
             of_nodes = totals_at(connection, number - 1).nodes
-        was, now = ({ids[key]: places[key] for key in before} for places in (before, after))
+            was, now = ({ids[key]: places[key] for key in before} for places in (before, after))
         return replace(moves(was, now, goals), of_nodes=of_nodes)
 
     def _named(self, connection: Connection, table: Table, some: Iterable[NodeId]) -> Iterator[Row]:

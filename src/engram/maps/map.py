@@ -428,7 +428,6 @@ class Map:
     frontends = _kept(reading.frontends_of_sessions)
     omissions = _kept(reading.load_omissions)
     landmark_hashes = _kept(reading.landmark_hashes)
-    blob_sizes = _kept(reading.blob_sizes)
     partial_paths = _kept(reading.partial_paths)
 
     @cached_property
@@ -457,11 +456,6 @@ class Map:
         """The cameras of its sessions, by id."""
         with self._database.reading() as connection:
             return {one.id: one for one in reading.load_cameras(connection).values()}
-
-    def known_among(self, some: Sequence[bytes]) -> frozenset[bytes]:
-        """The UUIDs whose nodes are held or were omitted, and need not be handed in."""
-        with self._database.reading() as connection:
-            return reading.known_among(connection, self._view, some)
 
     def words(self, vocabulary: bytes, some: Sequence[NodeId]) -> dict[NodeId, NDArray[np.int32]]:
         """The stored words (n,) of some nodes by the vocabulary of this hash, rising.

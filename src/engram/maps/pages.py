@@ -6,8 +6,11 @@ the nodes of a page were saved one after another.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -27,11 +30,18 @@ from engram.errors import MapCorruptError
 from engram.geometry.cameras import CameraId
 from engram.graph.basin import BasinCounts, MatchBasin
 from engram.graph.graph import EDGE_KINDS
-from engram.graph.model import EdgeKind, NodeId, PathEntryKind, PathId, SessionId
+from engram.graph.model import (
+    EdgeKind,
+    NodeId,
+    PathEntry,
+    PathEntryKind,
+    PathId,
+    SessionId,
+)
 from engram.graph.pages import PAGE, GraphPage
 from engram.graph.paths import ENTRY_KINDS, Attempts, Evidence
 from engram.maps.attempts import PAGE as ATTEMPT_PAGE
-from engram.maps.attempts import page_of, unpack
+from engram.maps.attempts import page_of, unpack, unpack_drive
 from engram.maps.columns import Columns, Visible, read_columns
 from engram.maps.counting import count_open, totals_of
 from engram.maps.marks import removed_measurements, without_removed
@@ -98,13 +108,17 @@ class MapPages:
 
     def page(self, number: int) -> GraphPage:
         """See `GraphPages`."""
-        keys = {"first": number * PAGE + 1, "last": (number + 1) * PAGE}
+        return self.part(number * PAGE, (number + 1) * PAGE)
+
+    def part(self, first: int, end: int) -> GraphPage:
+        """The nodes from one dense index up to another, and their edges, as one large page."""
+        keys = {"first": first + 1, "last": end}
         with reading_rows(self._database.name):
             found = self._seen(nodes, self._database.rows(_NODES, keys))
             found = found.rows(np.argsort(found["key"], kind="stable"))
             joined = self._seen(edges, self._database.rows(_EDGES, keys))
             return GraphPage(
-                number,
+                first // PAGE,
                 (found["key"] - 1).astype(np.int32),
                 found["uuid"],
                 self._numbered(found),
@@ -188,19 +202,8 @@ class MapPages:
         self, first: int, end: int
     ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.uint8]]:
         """See `PathPages`."""
-        keys = {"first": first + 1, "last": end}
         with reading_rows(self._database.name):
-            # With those that may supersede them, at whichever node they are.
-            rows = {
-                row[0]: row
-                for query in (_ENTRIES, _SAME_PLACES)
-                for row in self._database.rows(query, keys)
-            }
-            found = self._seen(path_entries, list(rows.values()))
-            known = np.isin(found["path"], list(self._path_numbers))
-            found = found.rows(np.flatnonzero(known)).newest("path", "sequence")
-            here = (found["node"] > first) & (found["node"] <= end)
-            found = found.rows(np.flatnonzero(here))
+            found = self._entries(first, end)
             codes, texts = found.texts["kind"]
             kinds = [ENTRY_KINDS.index(member(PathEntryKind, one, "path_entries")) for one in texts]
             numbers = [self._path_numbers[key] for key in found["path"].tolist()]
@@ -215,6 +218,84 @@ class MapPages:
         """Counts of the attempts of all drives, from which match basins are learnt."""
         with self._database.reading() as connection:
             return totals_of(connection, self._view).basin_counts
+
+    def entries(self, first: int, end: int, ids: Mapping[int, NodeId]) -> list[PathEntry]:
+        """Path entries at nodes in a range of dense indices.
+
+        Args:
+            first, end: dense indices of the first node and of that after the last.
+            ids: the nodes in question, by dense index.
+        """
+        with reading_rows(self._database.name):
+            found = self._entries(first, end)
+            codes, texts = found.texts["kind"]
+            kinds = [member(PathEntryKind, text, "path_entries") for text in texts]
+            names = ("path", "sequence", "node", "stamp_ns")
+            rows = zip(*(found[name].tolist() for name in names), codes.tolist(), strict=True)
+            return [
+                PathEntry(
+                    self.paths[self._path_numbers[path]],
+                    sequence,
+                    ids[node - 1],
+                    kinds[code],
+                    stamp_ns,
+                )
+                for path, sequence, node, stamp_ns, code in rows
+                if node - 1 in ids
+            ]
+
+    def _entries(self, first: int, end: int) -> Columns:
+        """The newest entries that are at nodes of a range."""
+        keys = {"first": first + 1, "last": end}
+        # With those that may supersede them, at whichever node they are.
+        rows = {
+            row[0]: row
+            for query in (_ENTRIES, _SAME_PLACES)
+            for row in self._database.rows(query, keys)
+        }
+        found = self._seen(path_entries, list(rows.values()))
+        known = np.isin(found["path"], list(self._path_numbers))
+        found = found.rows(np.flatnonzero(known)).newest("path", "sequence")
+        here = (found["node"] > first) & (found["node"] <= end)
+        return found.rows(np.flatnonzero(here))
+
+    def attempts(self, some: NDArray[np.int64]) -> Attempts:
+        """The remembered attempts between some nodes (N,), given and returned by dense index.
+
+        Returns:
+            `session` is a place in `sessions`; each session's attempts in order.
+        """
+        chosen = np.zeros(self.end + 1, np.bool_)
+        chosen[some + 1] = True
+        parts = []
+        with reading_rows(self._database.name):
+            rows = self._attempt_rows(np.unique(page_of(some + 1)).tolist())
+            for session, own in groupby(rows, key=itemgetter("session")):
+                made = unpack_drive(list(own))
+                made = made.rows(np.flatnonzero(chosen[made.reference] & chosen[made.node]))
+                parts.append(
+                    replace(
+                        made,
+                        session=np.full(len(made), self._session_numbers[session], np.int32),
+                        reference=(made.reference - 1).astype(np.int32),
+                        node=(made.node - 1).astype(np.int32),
+                    )
+                )
+        return Attempts.joined(parts)
+
+    def _attempt_rows(self, pages: Iterable[int]) -> list[Row]:
+        """Rows of attempts on pages of nodes: session by session, earlier revisions first."""
+        rows = [
+            row
+            for page in pages
+            for row in verified(attempts, self._database.rows(_ON_PAGE, {"page": page}))
+            if self._visible.has(attempts, row["key"], row["revision"])
+            and row["session"] in self._session_numbers
+        ]
+        numbers, places = self._session_numbers, self._visible.places
+        return sorted(
+            rows, key=lambda row: (numbers[row["session"]], places[row["revision"]], row["key"])
+        )
 
     def evidence(self, basin: MatchBasin) -> Callable[[int, int], Evidence]:
         """How past drives fared with the nodes from a dense index up to another one.
@@ -276,20 +357,7 @@ class MapPages:
 
     def _attempts_on(self, page: int) -> Attempts:
         """The attempts of all sessions, one after another, on a page of nodes."""
-        rows = [
-            row
-            for row in verified(attempts, self._database.rows(_ON_PAGE, {"page": page}))
-            if self._visible.has(attempts, row["key"], row["revision"])
-            and row["session"] in self._session_numbers
-        ]
-        places = self._visible.places
-        rows.sort(
-            key=lambda row: (
-                self._session_numbers[row["session"]],
-                places[row["revision"]],
-                row["key"],
-            )
-        )
+        rows = self._attempt_rows([page])
         made = Attempts.joined([self._between_visible(row) for row in rows])
         here = np.flatnonzero(page_of(made.node) == page)
         return made if len(here) == len(made) else made.rows(here)

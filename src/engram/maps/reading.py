@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -51,7 +51,6 @@ from engram.maps.schema import (
     attempts,
     cameras,
     edges,
-    frames,
     frontends,
     nodes,
     omissions,
@@ -66,8 +65,6 @@ from engram.maps.schema import (
 )
 from engram.maps.view import View, few
 
-# As many UUIDs as one statement takes.
-_FEW = 500
 # Most numbers per key that a table of all of them may span.
 _DENSE = 16
 _KEY = sessions.c.key
@@ -293,40 +290,6 @@ def landmark_hashes(connection: Connection, view: View) -> dict[NodeId, bytes]:
         query = view.select(table).with_only_columns(table.c.uuid, table.c.landmark_hash)
         found |= {node_from_bytes(row[0]): row[1] for row in connection.execute(query)}
     return found
-
-
-def known_uuids(connection: Connection, view: View) -> frozenset[bytes]:
-    """UUIDs of nodes that are held or were omitted, as stored."""
-    queries = (
-        view.select(table).with_only_columns(table.c.uuid)
-        for table in (nodes, omissions, omitted_landmarks)
-    )
-    return frozenset(row[0] for query in queries for row in connection.execute(query))
-
-
-def known_among(connection: Connection, view: View, some: Sequence[bytes]) -> frozenset[bytes]:
-    """Those of some UUIDs that are in `known_uuids`; a few are found without reading all."""
-    if len(some) > _FEW:
-        return known_uuids(connection, view) & frozenset(some)
-    found = set[bytes]()
-    for table in (nodes, omissions, omitted_landmarks):
-        query = view.select(table).with_only_columns(table.c.uuid).where(table.c.uuid.in_(some))
-        found.update(row[0] for row in connection.execute(query))
-    return frozenset(found)
-
-
-def blob_sizes(connection: Connection, view: View) -> dict[NodeId, tuple[int, int]]:
-    """Size in bytes of each node's landmarks and of its thumbnail."""
-    seen = view.select(nodes).with_only_columns(nodes.c.key, nodes.c.uuid)
-    ids = {row[0]: node_from_bytes(row[1]) for row in connection.execute(seen)}
-    query = select(
-        frames.c.node, func.length(frames.c.landmarks), func.length(frames.c.thumbnail)
-    ).order_by(frames.c.node)
-    return {
-        ids[key]: (landmarks, thumbnail or 0)
-        for key, landmarks, thumbnail in connection.execute(query)
-        if key in ids
-    }
 
 
 def partial_paths(connection: Connection, view: View) -> frozenset[PathId]:

@@ -372,7 +372,7 @@ _READERS: tuple[Callable[[Map], object], ...] = (
     lambda store: store.words(bytes(16), [one.id for one in store.load().nodes]),
     lambda store: store.omissions,
     lambda store: store.interrupted(),
-    lambda store: store.blob_sizes,
+    lambda store: store.lookups.blob_sizes([one.id for one in store.load().nodes]),
     lambda store: store.diff(0, "head"),
     lambda store: [store.origin(str(one.id)) for one in store.load().nodes[:2]],
     lambda store: [hour_of_day(one, one.start_ns) for one in store.sessions.values()],

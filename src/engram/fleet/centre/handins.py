@@ -295,7 +295,7 @@ def _blobs_needed(
 
     own = {node[1]: node[0] for node in rows("nodes", None)}
     with centre.reading(row.map) as store:
-        held = {own[uuid] for uuid in store.known_among(list(own))}
+        held = {own[uuid] for uuid in store.lookups.known(list(own))}
     found = []
     for frame in rows("frames", pages):
         if frame[0] not in held:

@@ -247,7 +247,7 @@ def learnt_latitude(stock: Stock) -> float | None:
     """
     if not stock.sessions:
         return None
-    focal_px = float(np.median([camera.fx for camera in stock.contents.cameras.values()]))
+    focal_px = float(np.median([camera.fx for camera in stock.cameras.values()]))
     won, tried = tallies(stock, MatchBasin.of(focal_px))
     hours = np.array(
         [_nan(hour_of_day(session, session.start_ns)) for session in stock.sessions], np.float64
@@ -331,7 +331,7 @@ def _mission_heights(
     if options.date is not None:
         day = float(date.fromisoformat(options.date).timetuple().tm_yday - 1)
     else:
-        day = day_of_year(max(session.begin_ns for session in stock.sessions))
+        day = day_of_year(max(session.begin_ns for session in stock.store.sessions.values()))
     arrive_h = options.depart_h if options.arrive_h is None else options.arrive_h
     span = np.linspace(0.0, (arrive_h - options.depart_h) % 24, 25)
     hours = (options.depart_h + span) % 24
@@ -385,20 +385,15 @@ class Demand:
         return float(self.weight.sum())
 
     @staticmethod
-    def of(stock: Stock, options: DownloadOptions, where: Mask | None) -> Demand:
-        """Places from all nodes, weights from path memory.
-
-        Args:
-            where: (N,) nodes along its route; None for anywhere.
-        """
+    def of(stock: Stock, options: DownloadOptions) -> Demand:
+        """Places from all nodes, weights from path memory; only in the mission's area."""
         places, place_of = _places(stock)
         weight = np.zeros((len(places), len(stock.sessions)))
         counts = importance(stock, options)
         for at, session in enumerate(stock.sessions):
             nodes = stock.on_path.get(path_id(session.id), np.zeros(0, np.int64))
             weight[np.unique(place_of[nodes]), at] = counts[at]
-        if where is not None:
-            weight[~np.isin(np.arange(len(places)), place_of[where])] = 0.0
+        weight[~np.isin(np.arange(len(places)), place_of[stock.area])] = 0.0
         return Demand(places, weight)
 
 
@@ -426,7 +421,7 @@ class Coverage:
 
     def __init__(self, stock: Stock, demand: Demand) -> None:
         self.demand = demand
-        focal_px = float(np.median([camera.fx for camera in stock.contents.cameras.values()] or 1))
+        focal_px = float(np.median([camera.fx for camera in stock.cameras.values()] or 1))
         basin = MatchBasin.of(focal_px)
         self._affinity = affinities(stock, basin)
         self._session_of = stock.session_of

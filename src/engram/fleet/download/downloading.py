@@ -21,7 +21,7 @@ from engram.errors import InputError
 from engram.files import check_parent, draft_folder
 from engram.fleet.download.coverage import Coverage, Forecast, Light, expected_missed
 from engram.fleet.download.mission import DownloadOptions
-from engram.fleet.download.part import Part, Stock, components, write_marks
+from engram.fleet.download.part import Part, Stock, write_marks
 from engram.fleet.download.selections import (
     SELECTIONS,
     Selection,
@@ -29,19 +29,22 @@ from engram.fleet.download.selections import (
     coverage_for,
     facts_told,
 )
+from engram.graph.graph import labels_of
 from engram.maps.map import Map
 from engram.maps.map_files import compact_map, publish_map
 from engram.monitor import QUIET, Monitor
 
-# Bytes of a node beside its blobs: rows and indices of it, its edges and path entries. Only the
-# start of the search for a budget: the file is measured. Source: lab/reports/constants.md.
-_ROWS_BYTES = 2500
-_PAGE_BYTES = 4096
-_TRIES = 8
-# A file that leaves less than this share of the budget free ends the search.
-_FULL_ENOUGH = 0.99
+# What a file takes, with indices: without a node; of a node besides its blobs; of each record about
+# it. Source: lab/reports/constants.md.
+_EMPTY_BYTES, _NODE_BYTES = 200_000, 700
+_EDGE_BYTES, _ENTRY_BYTES, _ATTEMPT_BYTES = 355, 68, 22
+# Bytes of a node's words, by those of its landmarks.
+_WORDS_SHARE = 0.06
+# A file that fills this share of the budget ends the search.
+_FULL_ENOUGH = 0.96
 # The share of the budget that the search aims at.
-_AIM = 0.995
+_AIM = 0.985
+_EVERYTHING = 100.0  # per cent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,16 +143,14 @@ def download(
         raise InputError(f"{out} exists already; choose another name")
     check_parent(out)
     with Map.open(centre, at=at) as store:
-        stock = Stock(store)
-        if not len(stock):
-            raise InputError(f"{store.location} holds no nodes at revision {store.revision}")
+        stock = stocked(store, options)
         selection = SELECTIONS[options.select](stock, options)
         coverage = selection.coverage or coverage_for(stock, options)
         with draft_folder(out) as folder:
             part, why = choose_part(stock, selection, options, folder, monitor)
-            _write_draft(part, options, folder, monitor)
             compact = folder / _COMPACT
-            compact_map(folder / _DRAFT, compact)
+            if selection.order is None:
+                written(part, options, folder, monitor)
             report = _report(part, why, coverage, compact, out, options)
             publish_map(compact, out)
     return report
@@ -163,29 +164,26 @@ def choose_part(
 ) -> tuple[Part, Mapping[str, Any]]:
     """The part of a selection, and facts of it; for a budget, as much as fits.
 
-    A budget writes drafts into `folder` to measure them; the last one is the returned part.
+    A budget leaves the file of the part in `folder`, as `written` does.
     """
     if selection.order is None:
         return _part(stock, selection, options), selection.why
-    landmarks, thumbnails = stock.sizes
-    blobs = landmarks + thumbnails * options.with_thumbnails
-    pages = np.ceil(blobs / _PAGE_BYTES) * _PAGE_BYTES + _ROWS_BYTES
+    expected_bytes = _expected_bytes(stock, selection.order, options)
+    why, budget_bytes = dict(selection.why), options.budget_bytes
     parts: dict[int, Part] = {}
 
     def measure(count: int) -> int:
         parts[count] = _part(stock, _beginning(selection, count), options)
-        _write_draft(parts[count], options, folder, monitor)
-        return _compacted_bytes(folder)
+        return written(parts[count], options, folder, monitor).stat().st_size
 
-    budget_bytes, why = options.budget_bytes, dict(selection.why)
+    if options.budget_percent == _EVERYTHING:
+        why["everything_bytes"] = measure(len(stock))
+        return parts[len(stock)], why
     if options.budget_percent is not None:
-        why["everything_bytes"] = everything_bytes = measure(len(selection.order))
+        why["everything_bytes"] = everything_bytes = int(expected_bytes[-1])
         budget_bytes = int(everything_bytes * options.budget_percent / 100)
-        if budget_bytes >= everything_bytes:
-            return parts[len(selection.order)], why
     assert budget_bytes is not None
-    count = most_that_fit(measure, np.cumsum(pages[selection.order]), budget_bytes)
-    return parts[count], why
+    return parts[most_that_fit(measure, expected_bytes, budget_bytes)], why
 
 
 def _part(stock: Stock, selection: Selection, options: DownloadOptions) -> Part:
@@ -193,50 +191,71 @@ def _part(stock: Stock, selection: Selection, options: DownloadOptions) -> Part:
     return Part.of(stock, selection.sent, whole=whole, thumbnails=options.with_thumbnails)
 
 
+def _expected_bytes(
+    stock: Stock, order: NDArray[np.int64], options: DownloadOptions
+) -> NDArray[np.float64]:
+    """(N,) float64: estimated size of the file of the first 1, 2, … N nodes of an order, bytes."""
+    landmarks, thumbnails = stock.sizes
+    nodes = _NODE_BYTES + (1 + _WORDS_SHARE) * landmarks + thumbnails * options.with_thumbnails
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    made = stock.attempts
+    # A record goes along with the last of its nodes.
+    rows = (
+        (_EDGE_BYTES, place[stock.graph.edge_ends].max(axis=1)),
+        (_ENTRY_BYTES, place[np.concatenate([order[:0], *stock.on_path.values()])]),
+        (_ATTEMPT_BYTES, np.maximum(place[made.reference], place[made.node])),
+    )
+    about = sum(each * np.bincount(at, minlength=len(order)) for each, at in rows)
+    fixed_bytes = _EMPTY_BYTES + len(stock.store.vocabulary or b"")
+    return np.asarray(fixed_bytes + np.cumsum(nodes[order] + about), np.float64)
+
+
 def most_that_fit(
     measure: Callable[[int], int], expected_bytes: NDArray[np.float64], budget_bytes: int
 ) -> int:
-    """Finds how many nodes fit into a budget, by writing files and measuring them.
+    """Finds how many nodes fit into a budget, by writing a file and measuring it.
 
-    The file of one node gives the fixed size: vocabulary, statistics. Sizes are then predicted from
-    `expected_bytes` until a file is too large, and after that by a line from the largest file that
-    fits to the smallest that does not.
+    The first file has as many as are expected to fit. If it is too large, or leaves much free, a
+    second one corrects the expectation by it; only where that is too large, too, come smaller ones.
 
     Args:
-        measure: writes the file of the first n nodes and returns its size, bytes.
-        expected_bytes: (N,) float64, expected bytes of the first 1, 2, … N nodes; increasing.
+        measure: writes the file of the first n nodes and returns its size, bytes; the last file
+            written is the one of the result.
+        expected_bytes: (N,) float64, expected size of the file of the first 1, 2, … N nodes,
+            bytes; increasing.
 
-    Source: regula falsi, with the Illinois algorithm's halving if one end stays (Dowell and
-
-    Jarratt, BIT 11, 1971): sizes bend where later nodes bring fewer edges.
+    Raises:
+        InputError: not one node fits.
     """
-    fits, fits_bytes = 1, measure(1)
-    if fits_bytes > budget_bytes:
-        raise InputError(
-            f"not one node fits into {budget_bytes} bytes: the map's vocabulary, statistics and "
-            f"the most useful node with its session take {fits_bytes} bytes; give a larger --budget"
-        )
-    too_many, too_many_bytes = len(expected_bytes) + 1, 0
     aimed_bytes = _AIM * budget_bytes
-    low_weight = high_weight = 1.0
-    for _ in range(_TRIES):
-        if fits + 1 == too_many or fits_bytes >= _FULL_ENOUGH * budget_bytes:
-            break
-        room = aimed_bytes - fits_bytes
-        if too_many_bytes:
-            below, above = room * low_weight, (too_many_bytes - aimed_bytes) * high_weight
-            room = expected_bytes[too_many - 1] - expected_bytes[fits - 1]
-            room *= below / (below + above)
-        wanted = np.searchsorted(expected_bytes, expected_bytes[fits - 1] + room, side="right")
-        count = int(np.clip(wanted, fits + 1, too_many - 1))
-        size_bytes = measure(count)
+    count = _fitting(expected_bytes, aimed_bytes)
+    size_bytes = measure(count)
+    if size_bytes <= budget_bytes and (
+        count == len(expected_bytes) or size_bytes >= _FULL_ENOUGH * budget_bytes
+    ):
+        return count
+    while True:
+        scaled = expected_bytes * (size_bytes / expected_bytes[count - 1])
+        again = _fitting(scaled, aimed_bytes)
+        if size_bytes > budget_bytes:
+            if count == 1:
+                raise InputError(
+                    f"not one node fits into {budget_bytes} bytes: the map's vocabulary, "
+                    f"statistics and the most useful node with its session take {size_bytes} "
+                    "bytes; give a larger --budget"
+                )
+            again = min(again, count - 1)
+        elif again <= count:
+            return count
+        count, size_bytes = again, measure(again)
         if size_bytes <= budget_bytes:
-            fits, fits_bytes = count, size_bytes
-            low_weight, high_weight = 1.0, high_weight / 2
-        else:
-            too_many, too_many_bytes = count, size_bytes
-            low_weight, high_weight = low_weight / 2, 1.0
-    return fits
+            return count
+
+
+def _fitting(expected_bytes: NDArray[np.float64], budget_bytes: float) -> int:
+    """How many nodes are expected to fit; at least one."""
+    return max(int(np.searchsorted(expected_bytes, budget_bytes, side="right")), 1)
 
 
 def _beginning(selection: Selection, count: int) -> Selection:
@@ -246,15 +265,8 @@ def _beginning(selection: Selection, count: int) -> Selection:
     return replace(selection, sent=sent)
 
 
-def _compacted_bytes(folder: Path) -> int:
-    compact = folder / _COMPACT
-    compact_map(folder / _DRAFT, compact)
-    size_bytes = compact.stat().st_size
-    compact.unlink()
-    return size_bytes
-
-
-def _write_draft(part: Part, options: DownloadOptions, folder: Path, monitor: Monitor) -> None:
+def written(part: Part, options: DownloadOptions, folder: Path, monitor: Monitor) -> Path:
+    """Writes a part as a map file of a folder of its own, in place of an earlier one."""
     for old in folder.iterdir():
         old.unlink()
     stock = part.stock
@@ -270,6 +282,19 @@ def _write_draft(part: Part, options: DownloadOptions, folder: Path, monitor: Mo
         writer.commit()
         if stock.words is not None:
             stock.words.give(draft, part.node_ids)
+    compact_map(folder / _DRAFT, compact := folder / _COMPACT)
+    return compact
+
+
+def stocked(store: Map, options: DownloadOptions) -> Stock:
+    """The fleet map around a mission.
+
+    Raises:
+        InputError: it has no nodes, or not those that the mission names.
+    """
+    if not store.node_count():
+        raise InputError(f"{store.location} holds no nodes at revision {store.revision}")
+    return Stock(store, options)
 
 
 def revision_of(stock: Stock, options: DownloadOptions) -> dict[str, Any]:
@@ -312,18 +337,18 @@ def _report(
         source_hash=stock.content_hash,
         content_hash=content_hash,
         nodes=info.nodes,
-        of_nodes=len(stock),
+        of_nodes=stock.store.node_count(),
         sessions=info.sessions,
         partial_paths=len(part.partial_paths()),
         edges=info.edges,
         bridges=len(part.bridges),
-        components=len(np.unique(components(len(stock), ends)[sent])),
+        components=len(np.unique(labels_of(ends, len(stock))[sent])),
         size_bytes=file.stat().st_size,
         of_bytes=stock.store.info().size_bytes,
         why=dict(why),
         expected_missed=missed,
         copy_missed=copy_missed,
         forecast=Forecast.of(
-            missed, missed - copy_missed, len(stock.sessions), Light.of(stock, options)
+            missed, missed - copy_missed, len(stock.store.sessions), Light.of(stock, options)
         ),
     )

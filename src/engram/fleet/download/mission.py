@@ -73,7 +73,7 @@ class DownloadOptions(DownloadSettings):
         date: the mission's date, "2026-11-17"; None for that of the fleet map's newest drive. It
             gives the height of the sun at those hours.
         budget_bytes: `budget`: largest size of the file.
-        budget_percent: `budget`: the same, in per cent of a file with all nodes.
+        budget_percent: `budget`: the same, in per cent of a file with all nodes around the mission.
         near: `region`, and any selection but `copy` and `route`: beginnings of UUIDs of nodes.
         route: `route`, and any selection but `copy` and `region`: beginning of the UUID of a
             session that drove it.

@@ -14,14 +14,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.errors import InputError
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.surroundings import Surroundings
+from engram.geometry.cameras import CameraId, StereoCamera
 from engram.geometry.se3 import SE3, propagate_covariance
 from engram.graph.clock import hour_of_day, zone_note
-from engram.graph.graph import ExperienceGraph, Links
+from engram.graph.graph import EDGE_KINDS, EdgeTable, ExperienceGraph, Links, labels_of
 from engram.graph.model import (
     Amendment,
     Edge,
@@ -38,6 +42,7 @@ from engram.graph.model import (
     SessionId,
     path_id,
 )
+from engram.graph.pages import PAGE, GraphPage
 from engram.graph.paths import Attempts
 from engram.maps.map import Map
 from engram.maps.map_frame import ORIGIN
@@ -54,37 +59,138 @@ _LISTED = 3
 
 
 class Stock:
-    """A fleet map as of one revision, for selections.
+    """A fleet map as of one revision, for selections: all of it, or what lies around a mission.
+
+    Args:
+        store: the fleet map.
+        options: the mission; around its route or region the map is read. None for all of it.
 
     Attributes:
-        sessions: in the order of their starts, then UUIDs.
+        sessions: that saved, passed or attempted a node of it, in the order of their starts, then
+            UUIDs; of the whole map all.
         nodes: by session, then stamp, then UUID.
+        node_ids: their UUIDs.
         index: place of each node in `nodes`.
+        area: (N,) bool, the nodes of the mission's route or region; all without one.
+        seeds: number of nodes that the area was searched from.
         edges: by their ends and kind.
         graph: of these nodes and edges; dense indices are places in `nodes`.
+        entries: path entries by path and sequence.
+        on_path: (n,) int64 for each path: places of its nodes in order, once per visit.
+        attempts: remembered attempts; sessions and nodes are places in `sessions` and `nodes`.
+        session_of: (N,) int64, place of each node's session.
+        whole: whether it is the whole map.
     """
 
-    def __init__(self, store: Map) -> None:
+    def __init__(self, store: Map, options: DownloadOptions | None = None) -> None:
         self.store = store
-        self.contents = store.load()
-        self.sessions: list[Session] = sorted(
-            self.contents.sessions, key=lambda session: (session.start_ns, session.id)
-        )
+        seeds = None if options is None else _seeds(store, options)
+        if options is None or seeds is None:
+            here, self.seeds = Surroundings.everything(store.pages), 0
+        else:
+            runs = store.lookups.runs()
+            here = Surroundings.of(store.pages, runs, np.unique(seeds), options.radius_m)
+            self.seeds = len(seeds)
+        self.whole = here.whole
+        ranked = sorted(store.sessions.values(), key=lambda session: (session.start_ns, session.id))
+        found, order = here.found, self._read_nodes(here.found, ranked)
+        self.area: Mask = here.inside[order]
+        self._read_edges(found, order)
+        keys = found.nodes[order].astype(np.int64)
+        self._read_entries(dict(zip(keys.tolist(), self.node_ids, strict=True)))
+        made = store.pages.attempts(np.sort(keys))
+        ids = [store.pages.sessions[at] for at in np.unique(made.session).tolist()]
+        used = {node.session for node in self.nodes}.union(ids)
+        self.sessions: list[Session] = [
+            session
+            for session in ranked
+            if self.whole or session.id in used or path_id(session.id) in self.on_path
+        ]
         place = {session.id: at for at, session in enumerate(self.sessions)}
-        self.nodes: list[Node] = sorted(
-            self.contents.nodes, key=lambda node: (place[node.session], node.stamp_ns, node.id)
-        )
-        self.index = {node.id: at for at, node in enumerate(self.nodes)}
-        self.edges: list[Edge] = sorted(
-            self.contents.edges, key=lambda edge: (edge.a, edge.b, edge.kind)
-        )
-        self.graph = ExperienceGraph()
-        for node in self.nodes:
-            self.graph.add_node(node)
-        self.graph.add_edges(self.edges)
         self.session_of: NDArray[np.int64] = np.array(
             [place[node.session] for node in self.nodes], np.int64
         )
+        self.attempts = self._placed(made, place, keys)
+
+    def _read_nodes(self, found: GraphPage, ranked: Sequence[Session]) -> NDArray[np.intp]:
+        """Makes the nodes; returns their rows in `found`."""
+        rank = {session.id: at for at, session in enumerate(ranked)}
+        sessions = self.store.pages.sessions
+        uuids = found.uuids.tobytes()
+        records = [
+            Node(
+                NodeId(UUID(bytes=uuids[16 * at : 16 * at + 16])),
+                sessions[session],
+                stamp_ns,
+                found.cameras[at],
+                driven_m,
+            )
+            for at, (session, stamp_ns, driven_m) in enumerate(
+                zip(
+                    *(one.tolist() for one in (found.sessions, found.stamps_ns, found.driven_m)),
+                    strict=True,
+                )
+            )
+        ]
+        order = sorted(
+            range(len(records)),
+            key=lambda at: (rank[records[at].session], records[at].stamp_ns, records[at].id),
+        )
+        self.nodes: list[Node] = [records[at] for at in order]
+        self.node_ids: list[NodeId] = [node.id for node in self.nodes]
+        self.index = {node: at for at, node in enumerate(self.node_ids)}
+        return np.array(order, np.intp)
+
+    def _read_edges(self, found: GraphPage, order: NDArray[np.intp]) -> None:
+        place = np.empty(len(order), np.int32)
+        place[order] = np.arange(len(order))
+        ends = place[np.searchsorted(found.nodes, found.ends)]
+        by_uuid = np.empty(len(order), np.int64)
+        by_uuid[sorted(range(len(order)), key=self.node_ids.__getitem__)] = np.arange(len(order))
+        kind_rank = np.argsort(np.argsort([str(kind) for kind in EDGE_KINDS]))
+        rows = np.lexsort((kind_rank[found.kinds], by_uuid[ends[:, 1]], by_uuid[ends[:, 0]]))
+        self.graph = ExperienceGraph()
+        self.graph.add_nodes(self.nodes)
+        self.graph.add_edges(
+            EdgeTable(
+                self.nodes,
+                ends[rows],
+                found.kinds[rows],
+                found.poses[rows],
+                found.covariances[rows],
+            )
+        )
+        self.edges = self.graph.edges
+
+    def _read_entries(self, ids: dict[int, NodeId]) -> None:
+        """Reads path entries at nodes, given by their dense indices in the map."""
+        pages = self.store.pages
+        ranges = [(0, pages.end)]
+        if not self.whole:
+            numbers = sorted({index // PAGE for index in ids})
+            ranges = [(number * PAGE, (number + 1) * PAGE) for number in numbers]
+        read = (entry for begin, end in ranges for entry in pages.entries(begin, end, ids))
+        self.entries: list[PathEntry] = sorted(read, key=lambda one: (one.path, one.sequence))
+        visited: dict[PathId, list[int]] = {}
+        for entry in self.entries:
+            visited.setdefault(entry.path, []).append(self.index[entry.node])
+        self.on_path: dict[PathId, NDArray[np.int64]] = {
+            path: np.array(nodes, np.int64) for path, nodes in visited.items()
+        }
+
+    def _placed(
+        self, made: Attempts, place: Mapping[SessionId, int], keys: NDArray[np.int64]
+    ) -> Attempts:
+        """Attempts whose sessions and nodes are numbered as in the map."""
+        sessions = [place.get(session, -1) for session in self.store.pages.sessions]
+        order = np.argsort(keys)
+        attempts = replace(
+            made,
+            session=np.array(sessions, np.int32)[made.session],
+            reference=order[np.searchsorted(keys[order], made.reference)].astype(np.int32),
+            node=order[np.searchsorted(keys[order], made.node)].astype(np.int32),
+        )
+        return attempts.rows(np.argsort(attempts.session, kind="stable"))
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -99,15 +205,16 @@ class Stock:
         return self.store.content_hash()
 
     @cached_property
+    def cameras(self) -> dict[CameraId, StereoCamera]:
+        """Cameras of the sessions and nodes, by id."""
+        used = {one.camera for one in self.sessions} | {one.camera for one in self.nodes}
+        return {camera: one for camera, one in self.store.cameras.items() if camera in used}
+
+    @cached_property
     def words(self) -> NodeWords | None:
         """Words of the nodes; None while the fleet map is empty."""
         kind = self.store.descriptor
         return None if kind is None else words_of(self.store, kind)
-
-    @cached_property
-    def node_ids(self) -> list[NodeId]:
-        """UUIDs of `nodes`."""
-        return [node.id for node in self.nodes]
 
     @cached_property
     def hours(self) -> Array:
@@ -136,50 +243,39 @@ class Stock:
         return self.hours
 
     @cached_property
-    def on_path(self) -> dict[PathId, NDArray[np.int64]]:
-        """(n,) int64 for each path: dense indices of its nodes in order, once per visit."""
-        found: dict[PathId, list[int]] = {}
-        for entry in self.contents.path_entries:
-            found.setdefault(entry.path, []).append(self.index[entry.node])
-        return {path: np.array(nodes, np.int64) for path, nodes in found.items()}
-
-    @cached_property
-    def entries(self) -> list[PathEntry]:
-        """Path entries by path and sequence."""
-        return sorted(self.contents.path_entries, key=lambda entry: (entry.path, entry.sequence))
-
-    @cached_property
-    def attempts(self) -> Attempts:
-        """Remembered attempts; sessions and nodes are places in `sessions` and `nodes`."""
-        made = self.contents.attempts
-        place = {session.id: at for at, session in enumerate(self.sessions)}
-        session = np.array([place[session.id] for session in self.contents.sessions], np.int32)
-        node = np.array([self.index[node.id] for node in self.contents.nodes], np.int32)
-        attempts = replace(
-            made,
-            session=session[made.session],
-            reference=node[made.reference],
-            node=node[made.node],
-        )
-        return attempts.rows(np.argsort(attempts.session, kind="stable"))
+    def partial_paths(self) -> frozenset[PathId]:
+        """Paths of which some entries are elsewhere: in the map around, or nowhere in it."""
+        counts = {} if self.whole else self.store.lookups.entry_counts(list(self.on_path))
+        outside = {path for path, count in counts.items() if count > len(self.on_path[path])}
+        return frozenset(outside | self.store.partial_paths)
 
     @cached_property
     def sizes(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """(N,) bytes of the landmarks of each node, and (N,) of its thumbnail."""
-        sizes = self.store.blob_sizes
-        both = np.array([sizes[node] for node in self.node_ids], np.int64).reshape(-1, 2)
-        return both[:, 0], both[:, 1]
+        sizes = self.store.lookups.blob_sizes(self.node_ids)
+        return sizes[:, 0], sizes[:, 1]
 
-    def named_node(self, prefix: str) -> int:
-        """Dense index of the one node whose UUID begins with `prefix`."""
-        origin = self.store.origin(prefix)
-        if origin.node not in self.index:
-            raise InputError(f"node {origin.node} was reverted in revision {origin.told[-1][0]}")
-        return self.index[origin.node]
 
-    def place_of(self, session: SessionId) -> int:
-        """Place of a session in `sessions`."""
-        return next(at for at, candidate in enumerate(self.sessions) if candidate.id == session)
+def _seeds(store: Map, options: DownloadOptions) -> NDArray[np.int64] | None:
+    """Dense indices of the nodes around which a mission's area lies; None without an area."""
+    if options.route is not None:
+        session = store.named_session(options.route)
+        passed = {entry.node for entry in store.lookups.entries(path_id(session.id))}
+        if not passed:
+            raise InputError(f"session {session.id} of {session.robot} has no node on its path")
+        return np.array([one.key - 1 for one in store.lookups.nodes(passed).values()], np.int64)
+    if options.near:
+        return np.array([_named_node(store, prefix) for prefix in options.near], np.int64)
+    return None
+
+
+def _named_node(store: Map, prefix: str) -> int:
+    """Dense index of the one node whose UUID begins with `prefix`."""
+    origin = store.origin(prefix)
+    held = store.lookups.nodes([origin.node])
+    if not held:
+        raise InputError(f"node {origin.node} was reverted in revision {origin.told[-1][0]}")
+    return held[origin.node].key - 1
 
 
 def _zones_told(sessions: Sequence[Session]) -> str:
@@ -224,15 +320,6 @@ def close_gaps(
     return [chosen[pair] for pair in sorted(chosen)]
 
 
-def components(count: int, ends: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(N,) label of each node's component."""
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    links = csr_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    return np.asarray(connected_components(links, directed=False)[1], np.int64)
-
-
 def _variance(covariance: Array) -> float:
     diagonal = np.diag(covariance)
     return max(float(diagonal[:3].sum() + _LEVER_M**2 * diagonal[3:].sum()), _LEAST_COST)
@@ -254,9 +341,9 @@ class _Search:
         # Edges between two sent nodes are sent themselves.
         self._through = ~(sent[steps.low] & sent[steps.high])
         inner = sent[ends].all(axis=1)
-        self._joined = components(len(nodes), ends[inner])
+        self._joined = labels_of(ends[inner], len(nodes))
         odometry = np.array([edge.kind is EdgeKind.ODOMETRY for edge in edges], np.bool_)
-        self._pieces = components(len(nodes), ends[inner & odometry])
+        self._pieces = labels_of(ends[inner & odometry], len(nodes))
         self._edge_of = {
             (int(low), int(high)): int(edge)
             for low, high, edge in zip(steps.low, steps.high, steps.edge, strict=True)
@@ -299,21 +386,11 @@ class _Search:
         return self._spanning(ordered), self._nearest(ordered)
 
     def _spanning(self, ordered: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        root = {int(label): int(label) for label in np.unique(self._joined)}
+        from scipy.cluster.hierarchy import DisjointSet
 
-        def find(label: int) -> int:
-            while root[label] != label:
-                root[label] = root[root[label]]
-                label = root[label]
-            return label
-
-        needed = []
-        for pair in ordered:
-            a, b = (find(int(self._joined[node])) for node in pair)
-            if a != b:
-                root[max(a, b)] = min(a, b)
-                needed.append(pair)
-        return needed
+        label = self._joined.tolist()
+        joined = DisjointSet(label)
+        return [(a, b) for a, b in ordered if joined.merge(label[a], label[b])]
 
     def _nearest(self, ordered: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Candidates of least variance from either end to the other's piece."""
@@ -436,10 +513,10 @@ class Part:
         )
 
     def partial_paths(self) -> set[PathId]:
-        """Paths of which some entries are left out, now or by an earlier download."""
+        """Paths of the sessions of which some entries are left out, now or earlier."""
         on_path = self.stock.on_path
         left = {path for path, nodes in on_path.items() if not self.sent[nodes].all()}
-        return left | set(self.stock.store.partial_paths)
+        return (left | self.stock.partial_paths) & {path_id(one.id) for one in self.sessions}
 
     def attempt_rows(self) -> NDArray[np.intp]:
         """(A,) intp: rows of the stock's attempts whose two nodes are sent."""
@@ -456,7 +533,7 @@ class Part:
         descriptor, frontend = self.stock.store.frontends[session.id]
         return writer.add_session(
             session,
-            self.stock.contents.cameras[session.camera],
+            self.stock.cameras[session.camera],
             descriptor=descriptor,
             frontend=frontend,
             partial=path_id(session.id) in partial,
@@ -492,7 +569,7 @@ class Part:
 
     def _sessions_wanted(self) -> Mask:
         stock = self.stock
-        if self.sent.all():
+        if self.stock.whole and self.sent.all():
             return np.ones(len(stock.sessions), np.bool_)
         wanted = np.zeros(len(stock.sessions), np.bool_)
         wanted[stock.session_of[self.sent]] = True
@@ -515,13 +592,13 @@ def write_marks(writer: RevisionWriter, part: Part) -> None:
     goal whose node is not sent moves to the nearest one that is.
     """
     store = part.stock.store
-    sent = set(part.node_ids)
+    sent, placed = set(part.node_ids), store.lookups.placements(part.node_ids)
     for removal in store.removals:
         if {removal.a, removal.b} <= sent:
             writer.add_mark(removal)
     for node in part.node_ids:
-        if node in store.placements:
-            writer.add_mark(Placement(node, store.placements[node]))
+        if node in placed:
+            writer.add_mark(Placement(node, placed[node]))
     for anchor in store.anchors:
         if anchor.node in sent:
             writer.add_mark(anchor)
@@ -545,11 +622,12 @@ def lacking_marks(part: Part, own: Map) -> list[Mark]:
         for goal in _goals(part)
         if goal.name not in own.goals and not had_goal(own.seen_goals, own.graph, goal)
     ]
-    if _one_frame(own.placements, store.placements):
+    placed = store.lookups.placements({*own.placements, *part.node_ids})
+    if _one_frame(own.placements, placed):
         lacking += [
-            Placement(node, store.placements[node])
+            Placement(node, placed[node])
             for node in part.node_ids
-            if node in store.placements and node not in own.placements
+            if node in placed and node not in own.placements
         ]
     return lacking
 
@@ -562,14 +640,31 @@ def _one_frame(own: Mapping[NodeId, SE3], fleet: Mapping[NodeId, SE3]) -> bool:
 
 def _goals(part: Part) -> Iterator[Goal]:
     """The goals, each in a sent node; without those that none is connected with."""
-    stock, sent = part.stock, part.sent
-    for _, goal in sorted(stock.store.goals.items()):
-        root = stock.index[goal.node]
-        if sent[root]:
+    store, sent = part.stock.store, set(part.node_ids)
+    left = [goal for goal in store.goals.values() if goal.node not in sent]
+    moved = {} if not left else _moved(store, left, part.node_ids)
+    for name, goal in sorted(store.goals.items()):
+        if goal.node in sent:
             yield goal
-            continue
-        tree = stock.graph.chains_from(root)
-        near = next((int(node) for node in tree.nodes if sent[node]), None)
-        if near is not None:
-            near_from_goal = tree.pose(near).inverse() @ goal.node_from_goal
-            yield Goal(goal.name, stock.node_ids[near], near_from_goal)
+        elif name in moved:
+            yield moved[name]
+
+
+def _moved(store: Map, goals: Sequence[Goal], sent: Sequence[NodeId]) -> dict[str, Goal]:
+    """Goals in the nearest of some nodes, by the map frame; without those not connected."""
+    lookups, runs = store.lookups, store.lookups.runs()
+    known = [*sent, *(goal.node for goal in goals)]
+    held, placed = lookups.nodes(known), lookups.placements(known)
+    component = {
+        node: int(runs.component[runs.find(np.array([one.key]))[0]]) for node, one in held.items()
+    }
+    found = {}
+    for goal in goals:
+        near = [node for node in sent if component[node] == component[goal.node] and node in placed]
+        if near and goal.node in placed:
+            at_m = np.array([placed[node].translation for node in near])
+            away_m = np.linalg.norm(at_m - placed[goal.node].translation, axis=1)
+            to = near[int(np.argmin(away_m))]
+            to_from_goal = placed[to].inverse() @ placed[goal.node] @ goal.node_from_goal
+            found[goal.name] = Goal(goal.name, to, to_from_goal)
+    return found

@@ -24,13 +24,11 @@ from engram.errors import ConfigError, InputError
 from engram.fleet.download.coverage import Coverage, Demand, greedy_order
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Mask, Stock
-from engram.graph.model import PathId, path_id
+from engram.graph.model import PathId
 
 MINUTES_PER_DAY = 1440.0
 # Minutes (60 µs): rounding may put a stamp on a boundary just before it.
 _ROUNDING_MIN = 1e-6
-# Least length of an edge, metres, so that nodes at one place are still a step apart.
-_LEAST_STEP_M = 1e-3
 
 Array = NDArray[np.float64]
 
@@ -217,7 +215,7 @@ def near_start(stock: Stock, options: DownloadOptions, where: Mask) -> tuple[Mas
     hours = stock.known_hours()
     apart_h = np.abs(hours - options.depart_h)
     apart_h = np.nan_to_num(np.minimum(apart_h, _HOURS - apart_h), nan=np.inf)
-    facts: dict[str, Any] = {"nodes_without_hour": int(np.isnan(hours).sum())}
+    facts: dict[str, Any] = {"nodes_without_hour": int(np.isnan(hours[where]).sum())}
     for window_min in _windows(options.window_min, options):
         sent = where & (apart_h <= window_min / 60 + _ROUNDING_H)
         if sent.any():
@@ -321,20 +319,19 @@ def select_tod(stock: Stock, options: DownloadOptions) -> Selection:
 
     Source: [G16] (4); method §7.
     """
-    return Selection(*near_start(stock, options, mission_area(stock, options)))
+    return Selection(*near_start(stock, options, stock.area))
 
 
 def select_paths(stock: Stock, options: DownloadOptions) -> Selection:
     """All nodes of the best paths of each of the mission's epochs. [G16] Algorithms 2 and 3."""
     stock.known_hours()
-    where = mission_area(stock, options)
-    chosen, why = best_paths(stock, options, where)
-    return Selection(where & _nodes_on(stock, chosen), why)
+    chosen, why = best_paths(stock, options, stock.area)
+    return Selection(stock.area & _nodes_on(stock, chosen), why)
 
 
 def select_tod_and_paths(stock: Stock, options: DownloadOptions) -> Selection:
     """Nodes that pass `tod` and lie on a path chosen by counts over those nodes (method §7)."""
-    near, facts = near_start(stock, options, mission_area(stock, options))
+    near, facts = near_start(stock, options, stock.area)
     chosen, why = best_paths(stock, options, near)
     return Selection(near & _nodes_on(stock, chosen), {**why, **facts})
 
@@ -343,8 +340,7 @@ def select_region(stock: Stock, options: DownloadOptions) -> Selection:
     """Nodes within `radius_m` of some nodes, along the edges."""
     if not options.near:
         raise ConfigError("selection region needs --near NODE, the beginning of a node's UUID")
-    seeds = [stock.named_node(prefix) for prefix in options.near]
-    return Selection(within(stock, np.array(seeds), options.radius_m), {"seeds": len(seeds)})
+    return Selection(stock.area, {"seeds": stock.seeds})
 
 
 def select_route(stock: Stock, options: DownloadOptions) -> Selection:
@@ -353,7 +349,7 @@ def select_route(stock: Stock, options: DownloadOptions) -> Selection:
         raise ConfigError(
             "selection route needs --route SESSION, the beginning of a session's UUID"
         )
-    return Selection(along_route(stock, options.route, options.radius_m), {})
+    return Selection(stock.area, {})
 
 
 def select_budget(stock: Stock, options: DownloadOptions) -> Selection:
@@ -438,37 +434,7 @@ def _check_no_mission(options: DownloadOptions) -> None:
 
 def coverage_for(stock: Stock, options: DownloadOptions) -> Coverage:
     """The forecast for a mission: its expected needs, and the gain of each node."""
-    has_area = options.route is not None or options.near
-    where = mission_area(stock, options) if has_area else None
-    return Coverage(stock, Demand.of(stock, options, where))
-
-
-def mission_area(stock: Stock, options: DownloadOptions) -> Mask:
-    """(N,) bool, the nodes of the mission's route or region; all without one."""
-    if options.route is not None:
-        return along_route(stock, options.route, options.radius_m)
-    if options.near:
-        return select_region(stock, options).sent
-    return stock.everything()
-
-
-def within(stock: Stock, seeds: NDArray[np.int64], radius_m: float) -> Mask:
-    """(N,) bool, the nodes within a distance of any seed, along the edges."""
-    from scipy.sparse.csgraph import dijkstra
-
-    links = stock.graph.lightest(lambda edge: max(edge.a_from_b.distance_m, _LEAST_STEP_M))
-    lengths_m = links.matrix(len(stock.graph))
-    distance_m = dijkstra(lengths_m, directed=False, indices=seeds, min_only=True, limit=radius_m)
-    return np.asarray(np.isfinite(distance_m), np.bool_)
-
-
-def along_route(stock: Stock, session: str, radius_m: float) -> Mask:
-    """(N,) bool, the nodes within a distance of a session's path, along the edges."""
-    named = stock.store.named_session(session)
-    seeds = stock.on_path.get(path_id(named.id))
-    if seeds is None:
-        raise InputError(f"session {named.id} of {named.robot} has no node on its path")
-    return within(stock, np.unique(seeds), radius_m)
+    return Coverage(stock, Demand.of(stock, options))
 
 
 def facts_told(why: Mapping[str, Any]) -> list[str]:

@@ -20,9 +20,9 @@ from engram.config import plain
 from engram.counts import counted
 from engram.errors import IncompatibleError, InputError
 from engram.files import draft_folder
-from engram.fleet.download.downloading import choose_part, revision_of
+from engram.fleet.download.downloading import choose_part, revision_of, stocked
 from engram.fleet.download.mission import DownloadOptions
-from engram.fleet.download.part import Mask, Part, Stock, lacking_marks
+from engram.fleet.download.part import Mask, Part, lacking_marks
 from engram.fleet.download.selections import SELECTIONS, check_options, facts_told
 from engram.fleet.merge.open_merge import FIRST_REPLAYED, position_of, uncertainty_m2
 from engram.graph.model import (
@@ -117,9 +117,7 @@ def update(
     if Path(centre).exists() and robot.exists() and robot.samefile(centre):
         raise InputError(f"{robot} is the fleet map itself; name the robot's map")
     with Map.open(centre, at=at) as store, Map.open(robot, writes=True) as own:
-        stock = Stock(store)
-        if not len(stock):
-            raise InputError(f"{store.location} holds no nodes at revision {store.revision}")
+        stock = stocked(store, options)
         selection = SELECTIONS[options.select](stock, options)
         with draft_folder(robot) as folder:
             part, why = choose_part(stock, selection, options, folder, monitor)
@@ -235,9 +233,10 @@ class _Update:
         known = copied | {_key(edge) for edge in self._own.edges}
         own = {node.id for node in self._own.nodes}
         present = own | set(self._part.node_ids)
-        for omitted, omission in sorted(self._stock.store.omissions.items()):
-            only_ours = omitted in own and omitted not in self._stock.index
-            if only_ours and omission.node in present:
+        fleet = self._stock.store.lookups
+        held = fleet.nodes(own)
+        for omitted, omission in sorted(fleet.omissions(own).items()):
+            if omitted not in held and omission.node in present:
                 at = position_of(omission)
                 tie = Edge(at.node, omitted, EdgeKind.MATCH, at.node_from_live, at.covariance)
                 if _key(tie) not in known:
@@ -288,7 +287,8 @@ def _check_fits(part: Part, own: Map, contents: MapContents) -> None:
                 f"session {session.id} is a drive of {ours.robot} in {own.location} and another "
                 f"one, of {session.robot}, in the fleet map: one of the two maps is wrong"
             )
-    ours_of, theirs_of = own.landmark_hashes, part.stock.store.landmark_hashes
+    ours_of = own.landmark_hashes
+    theirs_of = part.stock.store.lookups.landmark_hashes(part.node_ids)
     for node in part.node_ids:
         if ours_of.get(node, theirs_of[node]) != theirs_of[node]:
             raise IncompatibleError(
