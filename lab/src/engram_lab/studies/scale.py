@@ -15,27 +15,43 @@ the vocabulary. Times are of the processor.
 from __future__ import annotations
 
 import multiprocessing
+import resource
 import shutil
 import sqlite3
 import time
 import zlib
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest import mock
 
 import msgspec
 import numpy as np
 from sqlalchemy import Table
 
 from engram import __version__
+from engram.fleet.download.downloading import download
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.merge.merging import merge
+from engram.fleet.merge.replay import Replay, Segment
+from engram.fleet.merge.report import SegmentReport
 from engram.frontend.blobs import blob_hash, decode_landmarks
 from engram.frontend.frame import Frame, FrameStatus
 from engram.geometry.se3 import SE3
-from engram.graph.model import Edge, EdgeKind, Node, PathEntryKind, Session, path_id
+from engram.graph.model import (
+    Clock,
+    Edge,
+    EdgeKind,
+    Node,
+    PathEntry,
+    PathEntryKind,
+    Session,
+    path_id,
+)
 from engram.graph.paths import Attempts
 from engram.graph.placing import MAP_FROM_CAMERA
 from engram.localiser.localisation import Position
@@ -103,7 +119,8 @@ class City:
     def drive(self, street: int, lane: int) -> Session:
         """The drive along a lane of a street."""
         start_ns = _FIRST_NS + (street * LANES + lane) * 3_600_000_000_000
-        return drive_of("fleet", start_ns, f"{street}-{lane}")
+        made = drive_of("fleet", start_ns, f"{street}-{lane}")
+        return replace(made, clock=Clock.UTC, longitude_deg=0.0)
 
     def node(self, street: int, lane: int, metre: int) -> Node:
         """The node at a metre of a drive."""
@@ -459,11 +476,114 @@ def _seconds(questions: Mapping[str, Callable[[], object]]) -> dict[str, float]:
     return found
 
 
+def merge_in(path: Path, city: City) -> dict[str, float]:
+    """Merges drives into a copy of the map: half of their nodes are its own.
+
+    Of the others every second ten metres look as the driven street does, the rest as nowhere.
+    """
+    found: dict[str, float] = {}
+    with TemporaryDirectory(dir=path.parent) as folder:
+        for count in (50, 500):
+            shutil.copy(path, centre := Path(folder) / path.name)
+            _hand_in(path, robot := Path(folder) / f"robot-{count}.engram", city, count)
+            before_mb = peak_mb()
+            with _timed_replay() as replayed:
+                begun = time.process_time()
+                merge(centre, [robot])
+                whole = time.process_time() - begun
+            found[f"merge, {count} nodes, beyond the replay (s)"] = whole - replayed[0]
+            found[f"its replay and reading of the graph, {count} nodes (s)"] = replayed[0]
+            begun = time.process_time()
+            merge(centre, [robot])
+            found[f"merge again, {count} nodes (s)"] = time.process_time() - begun
+            found[f"merge, {count} nodes, peak (MB)"] = peak_mb() - before_mb
+            centre.unlink()
+    return found
+
+
+@contextmanager
+def _timed_replay() -> Iterator[list[float]]:
+    """Counts the seconds that replays of segments take meanwhile."""
+    taken, replay = [0.0], Replay.segment
+
+    def timed(self: Replay, session: Session, segment: Segment) -> SegmentReport:
+        begun = time.process_time()
+        try:
+            return replay(self, session, segment)
+        finally:
+            taken[0] += time.process_time() - begun
+
+    with mock.patch.object(Replay, "segment", timed):
+        yield taken
+
+
+def _hand_in(source: Path, target: Path, city: City, count: int) -> None:
+    """A robot's map of so many nodes, half of them of the city."""
+    places = range(BEGIN, BEGIN + min(count // 2, city.length - BEGIN))
+    known = [city.node(city.driven, 2, metre) for metre in places]
+    made = drive_of("robot", 3 * _FIRST_NS, str(count))
+    with (
+        Map.open(source) as fleet,
+        Map.create(target) as own,
+        own.begin_revision(author="scale", message="", configuration={}) as writer,
+    ):
+        for session in (fleet.sessions[known[0].session], made):
+            writer.add_session(session, CAMERA, descriptor=DESCRIPTOR, frontend=FRONTEND)
+        for one in fleet.frames.stored(known):
+            writer.copy_node(one)
+        at_start = Edge(
+            known[0].id, _late(made, 0).id, EdgeKind.MATCH, SE3.identity(), _MATCH_SIGMA
+        )
+        step = SE3(np.eye(3), np.array([0.0, 0.0, 1.0]))
+        for at, metre in enumerate(places):
+            seed = city.seed(city.driven, metre) if (at // 10) % 2 == 0 else 10**6 + at
+            look = np.random.default_rng((at, 7))
+            blob = landmark_bytes(np.random.default_rng((seed, 0)), look, LANDMARKS)
+            node = _late(made, at)
+            writer.copy_node(stored(node, blob))
+            before = _late(made, at - 1).id
+            writer.add_edge(
+                Edge(before, node.id, EdgeKind.ODOMETRY, step, _STEP_SIGMA) if at else at_start
+            )
+            writer.add_path_entry(
+                PathEntry(path_id(made.id), at, node.id, PathEntryKind.SAVED, node.stamp_ns)
+            )
+        writer.commit()
+
+
+def _late(made: Session, at: int) -> Node:
+    return node_of(made, made.start_ns + at * _PERIOD_NS, float(at))
+
+
+def download_in(path: Path, city: City) -> dict[str, float]:
+    """Downloads around a node of the driven street: seconds and the largest peak of memory."""
+    near, route = str(city.node(city.driven, 2, 250).id), str(city.drive(city.driven, 2).id)
+    around = DownloadOptions("region", near=(near,), radius_m=200.0)
+    asked = {
+        "region, 200 nodes": DownloadOptions("region", near=(near,)),
+        "region, 2,000 nodes": around,
+        "route, 2,700 nodes": DownloadOptions("route", route=route),
+        "tod+paths of 2,000 nodes": replace(around, select="tod+paths", depart_h=12.0),
+        "5 MB of 2,000 nodes": replace(around, select="budget", budget_bytes=5_000_000),
+    }
+    found: dict[str, float] = {}
+    before_mb = peak_mb()
+    with TemporaryDirectory(dir=path.parent) as folder:
+        for name, options in asked.items():
+            begun = time.process_time()
+            download(path, Path(folder) / "out.engram", options)
+            found[f"download {name} (s)"] = time.process_time() - begun
+            (Path(folder) / "out.engram").unlink()
+    return found | {"downloads, peak (MB)": peak_mb() - before_mb}
+
+
 MEASURES: Mapping[str, Callable[[Path, City], dict[str, float]]] = {
     "robot": drive_in,
     "writing": write_in,
     "questions": ask,
     "history": look_back,
+    "merge": merge_in,
+    "download": download_in,
 }
 
 
@@ -471,6 +591,11 @@ def resident_mb() -> float:
     """Resident memory of this process, MB."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * 4096 / 1e6
+
+
+def peak_mb() -> float:
+    """Largest resident memory of this process so far, MB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
 @dataclass(frozen=True, slots=True)
