@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, Table, select
 
-from engram.maps.columns import Columns, Visible
+from engram.maps.columns import Columns, Visible, in_history, stretches
 from engram.maps.marks import Removed, edge_key, removed_measurements, without_removed
 from engram.maps.rows import verified
-from engram.maps.runs import Keys
 from engram.maps.schema import (
     attempts,
     edges,
@@ -149,7 +148,7 @@ def _touched(
     """Which of these rows of a table are seen, and which of them count."""
     found = columns_of(table, rows.values())
     places = {**shown[0].places, **shown[1].places}
-    found = Visible(places, {}).in_history(found)
+    found = in_history(places, found)
     seen = np.stack([one.shows(table, found) for one in shown])
     counts = np.zeros_like(seen)
     for at in (0, 1):
@@ -278,12 +277,3 @@ def _own_of(connection: Connection, keys: Iterable[int]) -> Iterator[Own]:
         query = select(revisions).where(revisions.c.key.between(first, last))
         found = connection.execute(query.order_by(revisions.c.key))
         yield from map(own_rows, verified(revisions, found))
-
-
-def stretches(keys: Iterable[int] | Keys) -> Iterator[tuple[int, int]]:
-    """First and last of each stretch of successive keys."""
-    ordered = np.unique(np.fromiter(keys, np.int64))
-    ends = np.flatnonzero(np.diff(ordered) != 1)
-    firsts = ordered[np.append(0, ends + 1)[: len(ordered)]]
-    lasts = ordered[np.append(ends, len(ordered) - 1)[: len(ordered)]]
-    yield from zip(firsts.tolist(), lasts.tolist(), strict=True)

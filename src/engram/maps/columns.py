@@ -2,20 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Table, func, select
+from sqlalchemy import Connection, Select, Table, bindparam, func, select
 
 from engram import _core
 from engram.errors import MapCorruptError
 from engram.maps.rows import Row, describe, mismatch, verified
 from engram.maps.schema import attempts, edges, hidden, nodes, path_entries, revisions
-from engram.maps.view import View, place_in_history, places_in_history
+from engram.maps.view import LARGEST_KEY, View, place_in_history, places_in_history
 
+Keys = NDArray[np.int64]
+Ask = Callable[[Select[Any], dict[str, Any]], Iterable[Any]]
+# What was said of rows of a table, oldest first.
+_SAID = (
+    select(hidden.c.key, hidden.c.revision, hidden.c.target, hidden.c.hidden)
+    .where(hidden.c.record == bindparam("record"))
+    .where(hidden.c.target.between(bindparam("first"), bindparam("last")))
+    .order_by(hidden.c.key)
+)
+# The tables of which rows were ever hidden: a look-up each, where DISTINCT would read all.
+_RECORDS = """
+    WITH RECURSIVE known(record) AS (
+        SELECT min(record) FROM hidden
+        UNION ALL
+        SELECT (SELECT min(record) FROM hidden WHERE record > known.record) FROM known
+        WHERE known.record IS NOT NULL
+    )
+    SELECT record FROM known WHERE record IS NOT NULL
+"""
+_EVERY = (-(2**63), 2**63 - 1)
 _KINDS = {int: "i", float: "f", str: "s"}
 
 
@@ -118,52 +138,51 @@ def _in_history(connection: Connection, columns: Columns) -> Columns:
 class Visible:
     """Which rows a view shows, without asking the database.
 
+    What hides rows is looked up when they are met: a map may hide many more.
+
     Attributes:
         places: of the visible revisions in the history, by key.
-        hidden: keys of hidden rows, by name of the table.
+        ask: gives rows of `_SAID`.
+        records: the tables that have rows which were ever hidden, by name.
         until: largest key of the rows that are shown, by name of the table; of other tables all.
     """
 
     places: Mapping[int, int]
-    hidden: Mapping[str, frozenset[int]]
+    ask: Ask
+    records: frozenset[str]
     until: Mapping[str, int] = field(default_factory=dict)
+    _hidden: dict[str, frozenset[int]] = field(default_factory=dict)
 
     @staticmethod
-    def of(connection: Connection, *views: View) -> list[Visible]:
-        """What each view shows."""
+    def of(connection: Connection, *views: View, ask: Ask | None = None) -> list[Visible]:
+        """What each view shows.
+
+        Args:
+            connection: of the map.
+            views: the views.
+            ask: for use when the connection is closed; None to ask the connection.
+        """
         query = select(revisions.c.key, revisions.c.status, place_in_history())
         known = connection.execute(query.order_by(revisions.c.key)).fetchall()
-        columns = (hidden.c.revision, hidden.c.record, hidden.c.target, hidden.c.hidden)
-        said = connection.execute(select(*columns).order_by(hidden.c.key)).fetchall()
-        return [Visible._of(view, known, said) for view in views]
-
-    @staticmethod
-    def _of(view: View, known: Sequence[Any], said: Sequence[Any]) -> Visible:
-        places = {
-            key: place
-            for key, status, place in known
-            if key == view.own or (status == "committed" and place <= view.at)
-        }
-        newest = {
-            (record, target): hides
-            for revision, record, target, hides in sorted(
-                (one for one in said if one[0] in places), key=lambda one: places[one[0]]
-            )
-        }
-        found: dict[str, set[int]] = {}
-        for (record, target), hides in newest.items():
-            if hides:
-                found.setdefault(record, set()).add(target)
-        return Visible(places, {name: frozenset(keys) for name, keys in found.items()})
+        records = frozenset(connection.exec_driver_sql(_RECORDS).scalars())
+        found = []
+        for view in views:
+            places = {
+                key: place
+                for key, status, place in known
+                if key == view.own or (status == "committed" and place <= view.at)
+            }
+            found.append(Visible(places, ask or connection.execute, records))
+        return found
 
     def as_of_now(self, connection: Connection) -> Visible:
-        """Without what an open revision adds later to the tables of a graph."""
-        tables = (nodes, edges, path_entries, attempts)
+        """Without what an open revision adds, hides or shows later in the tables of a graph."""
+        tables = (nodes, edges, path_entries, attempts, hidden)
         newest = {
             one.name: connection.execute(select(func.max(one.c.key))).scalar() or 0
             for one in tables
         }
-        return replace(self, until=newest)
+        return replace(self, until=newest, _hidden={})
 
     def has(self, table: Table, key: int, revision: int) -> bool:
         """Whether a row is visible, by itself."""
@@ -171,8 +190,30 @@ class Visible:
         return kept and revision in self.places
 
     def hidden_of(self, table: Table) -> frozenset[int]:
-        """Keys of the table's hidden rows."""
-        return self.hidden.get(table.name, _NONE)
+        """Keys of all hidden rows of the table."""
+        if table.name not in self._hidden:
+            self._hidden[table.name] = self._hides(table, [_EVERY])
+        return self._hidden[table.name]
+
+    def hides(self, table: Table, keys: Keys) -> NDArray[np.bool_]:
+        """(N,) whether the rows with these keys, (N,), are hidden."""
+        gone = self._hidden.get(table.name)
+        if gone is None:
+            gone = self._hides(table, stretches(keys))
+        return np.isin(keys, list(gone)) if gone else np.zeros(len(keys), np.bool_)
+
+    def _hides(self, table: Table, within: Iterable[tuple[int, int]]) -> frozenset[int]:
+        if table.name not in self.records:
+            return frozenset()
+        newest: dict[int, tuple[int, int]] = {}
+        last_key = self.until.get(hidden.name, LARGEST_KEY)
+        for first, last in within:
+            asked = {"record": str(table.name), "first": first, "last": last}
+            for key, revision, target, hides in self.ask(_SAID, asked):
+                place = self.places.get(revision, -1)
+                if key <= last_key and place >= newest.get(target, (0, 0))[0]:
+                    newest[target] = place, hides
+        return frozenset(target for target, (_, hides) in newest.items() if hides)
 
     def rows(self, connection: Connection, table: Table) -> Iterator[Row]:
         """The visible rows of a table without references to nodes, verified, by key."""
@@ -190,15 +231,25 @@ class Visible:
             seen &= rows[key] <= self.until[table.name]
         at_nodes = [(name, nodes) for name in ("a", "b", "node") if name in table.c]
         for name, target in ((key, table), *at_nodes):
-            if gone := self.hidden_of(target):
-                seen &= ~np.isin(rows[name], list(gone))
+            seen &= ~self.hides(target, rows[name])
         return seen
 
     def in_history(self, rows: Columns) -> Columns:
         """Rows ordered by revision, those of invisible ones first, and then by key."""
-        known, which = np.unique(rows["revision"], return_inverse=True)
-        place = np.array([self.places.get(key, 0) for key in known.tolist()], np.int64)[which]
-        return rows.rows(np.lexsort((rows["key"], place)))
+        return in_history(self.places, rows)
 
 
-_NONE: frozenset[int] = frozenset()
+def in_history(places: Mapping[int, int], rows: Columns) -> Columns:
+    """Rows ordered by the places of their revisions, by key, and then by their own keys."""
+    known, which = np.unique(rows["revision"], return_inverse=True)
+    place = np.array([places.get(key, 0) for key in known.tolist()], np.int64)[which]
+    return rows.rows(np.lexsort((rows["key"], place)))
+
+
+def stretches(keys: Iterable[int] | Keys) -> Iterator[tuple[int, int]]:
+    """First and last of each stretch of successive keys."""
+    ordered = np.unique(np.fromiter(keys, np.int64))
+    ends = np.flatnonzero(np.diff(ordered) != 1)
+    firsts = ordered[np.append(0, ends + 1)[: len(ordered)]]
+    lasts = ordered[np.append(ends, len(ordered) - 1)[: len(ordered)]]
+    yield from zip(firsts.tolist(), lasts.tolist(), strict=True)

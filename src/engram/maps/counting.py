@@ -15,8 +15,8 @@ from engram.graph.basin import BasinCounts
 from engram.graph.graph import labels_of
 from engram.graph.model import EdgeKind
 from engram.maps.attempts import page_of
-from engram.maps.changes import Changes, Touched, columns_of, rows_within, stretches
-from engram.maps.columns import Columns
+from engram.maps.changes import Changes, Touched, columns_of, rows_within
+from engram.maps.columns import Columns, stretches
 from engram.maps.marks import without_removed
 from engram.maps.reading import descriptor_of, load_cameras
 from engram.maps.records import MapInfo

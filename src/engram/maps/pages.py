@@ -91,7 +91,7 @@ class MapPages:
             self.sessions: Sequence[SessionId] = [one.id for one in known.values()]
             self._session_numbers = {key: number for number, key in enumerate(known)}
             self._cameras: dict[int, CameraId] = {key: one.id for key, one in cameras.items()}
-            (visible,) = Visible.of(connection, view)
+            (visible,) = Visible.of(connection, view, ask=database.rows)
             self._visible = visible.as_of_now(connection)
             path_rows = list(view.rows(connection, paths))
             self._removed = removed_measurements(view.rows(connection, removals))

@@ -246,6 +246,7 @@ hidden = _table(
     _text("record", "table"),
     _int("target", "key"),
     _int("hidden", "1 hides, 0 shows again"),
+    Index("hidden_by_target", "record", "target"),
 )
 
 # Names of revisions. They belong to no revision: setting, moving or removing a tag changes neither
