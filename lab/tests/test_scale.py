@@ -13,7 +13,17 @@ from engram.maps.map_files import check_file
 from engram.places.recognisers import PLACES_PER_BLOCK, FabMap
 from engram.places.vocabulary import default_vocabulary
 from engram.places.words import NodeWords, PlaceBook
-from engram_lab.studies.scale import City, Figures, ask, drive_in, look_back, table, write_in
+from engram_lab.studies.scale import (
+    City,
+    Figures,
+    ask,
+    drive_in,
+    look_back,
+    lost_in,
+    map_in,
+    table,
+    write_in,
+)
 
 
 def test_a_city_is_a_sound_map_that_localises(tmp_path: Path) -> None:
@@ -29,6 +39,8 @@ def test_a_city_is_a_sound_map_that_localises(tmp_path: Path) -> None:
     figures = drive_in(path, city)
     assert figures["localised (%)"] > 90
     before = path.read_bytes()
+    assert lost_in(path, city)["lost: frames until found"] <= 3
+    assert map_in(path, city)["mapping: saved nodes"] == 3
     assert all(seconds >= 0 for seconds in write_in(path, city).values())
     assert set(ask(path, city)) == {"info (s)", "log (s)", "show NODE (s)"}
     assert {"diff (s)", "check --since (s)", "revert (s)"} < look_back(path, city).keys()

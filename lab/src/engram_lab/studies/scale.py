@@ -65,6 +65,7 @@ from engram.maps.sqlite import SqliteDatabase
 from engram.maps.upgrading import complete_history
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.places.vocabulary import Vocabulary, default_vocabulary, hash_of
+from engram.places.words import NodeWords
 from engram.robot.inspecting import describe_map
 from engram.sequences.sequence import LoggedFrame
 from engram_lab.synthetic_places import (
@@ -140,8 +141,15 @@ class City:
 
     def frame(self, metre: int) -> LoggedFrame:
         """What a live camera sees at a metre of the driven street, from metre `BEGIN` on."""
-        place = np.random.default_rng((self.seed(self.driven, metre), 0))
-        blob = landmark_bytes(place, np.random.default_rng((metre, 7)), LANDMARKS)
+        return self._seen((self.seed(self.driven, metre), 0), metre)
+
+    def changed(self, metre: int) -> LoggedFrame:
+        """What it sees there once the street has changed."""
+        return self._seen((self.seed(self.driven, metre), 1), metre)
+
+    def _seen(self, place: tuple[int, int], metre: int) -> LoggedFrame:
+        drawn = np.random.default_rng(place)
+        blob = landmark_bytes(drawn, np.random.default_rng((metre, 7)), LANDMARKS)
         landmarks = decode_landmarks(blob, CAMERA, DESCRIPTOR)
         stamp_ns = 2 * _FIRST_NS + metre * _PERIOD_NS
         frame = Frame(stamp_ns, CAMERA, landmarks, DESCRIPTOR, FRONTEND, FrameStatus.OK)
@@ -161,6 +169,8 @@ class City:
             database.commit()
         with closing(SqliteDatabase(path)) as made, made.writing() as connection:
             complete_history(connection)
+        with Map.open(path, writes=True) as opened:
+            NodeWords.of_map(opened, _vocabulary()).keep_missing()
 
 
 _AHEAD = OdometryStep(
@@ -395,6 +405,49 @@ def drive_in(path: Path, city: City) -> dict[str, float]:
         }
 
 
+def lost_in(path: Path, city: City) -> dict[str, float]:
+    """Opens the map and lets a robot find itself that knows no place."""
+    before_mb, begun = resident_mb(), time.process_time()
+    with Map.open(path) as opened, opened.robot(CAMERA) as robot:
+        taken, found_at = [], None
+        for step in range(20):
+            result = robot.step(city.frame(BEGIN + step))
+            taken.append(time.process_time() - begun)
+            if result.localised and found_at is None:
+                found_at = step + 1
+        return {
+            "lost: open and first proposals (s)": taken[0],
+            "lost: frames until found": np.nan if found_at is None else found_at,
+            "lost: memory (MB)": resident_mb() - before_mb,
+        }
+
+
+def map_in(path: Path, city: City) -> dict[str, float]:
+    """Maps a drive that knows half of its way, in a copy of the map."""
+    with TemporaryDirectory(dir=path.parent) as folder:
+        shutil.copy(path, copied := Path(folder) / path.name)
+        before_mb, begun = resident_mb(), time.process_time()
+        with Map.open(copied) as opened:
+            robot = opened.robot(CAMERA, name="mapper", maps=True)
+            certain = np.diag([0.1**2] * 3 + [0.01**2] * 3)
+            robot.place_at(Position(city.node(city.driven, 2, BEGIN).id, SE3.identity(), certain))
+            taken, saved, metres = [], 0, min(STEPS, city.length - BEGIN)
+            stretch = min(20, metres // 2)
+            for step in range(metres):
+                look = city.changed if (step // stretch) % 2 else city.frame
+                saved += robot.step(look(BEGIN + step)).saved is not None
+                taken.append(time.process_time() - begun)
+            grown_mb, driven = resident_mb() - before_mb, time.process_time()
+            robot.close()
+            return {
+                "mapping: open and first step (s)": taken[0],
+                "mapping: step (ms)": float(np.median(1e3 * np.diff(taken))),
+                "mapping: saved nodes": saved,
+                "mapping: close and commit (s)": time.process_time() - driven,
+                "mapping: memory (MB)": grown_mb,
+            }
+
+
 def write_in(path: Path, city: City) -> dict[str, float]:
     """Writes drives of 50 nodes and of one to a copy of the map, next to the driven street."""
     found: dict[str, float] = {}
@@ -579,6 +632,8 @@ def download_in(path: Path, city: City) -> dict[str, float]:
 
 MEASURES: Mapping[str, Callable[[Path, City], dict[str, float]]] = {
     "robot": drive_in,
+    "lost": lost_in,
+    "mapping": map_in,
     "writing": write_in,
     "questions": ask,
     "history": look_back,
