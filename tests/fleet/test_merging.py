@@ -61,7 +61,7 @@ def test_a_drive_through_streets_that_look_alike_is_not_folded_onto_itself(tmp_p
     (report,) = merged(centre, tmp_path / "robot.engram")
     assert (report.taken, report.omitted) == (len(mapped.saved), 0)
     with Map.open(centre) as store:
-        frame, edges = store.frame, store.graph.edges
+        frame, edges = store.layout(), store.graph.edges
     truth = truth_of(mapped)
     for edge in edges:
         true = truth[edge.a].inverse() @ truth[edge.b]
@@ -154,7 +154,7 @@ def test_the_settings_say_how_far_components_stand_apart(tmp_path, fleet, apart_
     merged(centre, first, other, settings=settings)
     with Map.open(centre) as store:
         new = [store.graph.index(node) for node in mapped.saved]
-        along_m = store.frame.positions[:, 0]
+        along_m = store.layout().positions[:, 0]
     gap_m = along_m[new].min() - np.delete(along_m, new).max()
     assert gap_m == pytest.approx(apart_m, abs=1e-6)
 

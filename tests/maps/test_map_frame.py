@@ -51,7 +51,7 @@ def write_anchors(path, copy, head: str, line) -> None:
 def test_a_road_lies_along_x_and_its_places_are_stored(road):
     with Map.open(road) as store:
         assert len(store.placements) == len(store.graph)
-        at = store.frame.positions
+        at = store.layout().positions
         assert np.ptp(at[:, 0]) == pytest.approx(19, abs=0.5)
         assert np.abs(at[:, 1:]).max() < 0.5
 

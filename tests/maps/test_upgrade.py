@@ -39,7 +39,7 @@ def rows_of(path: Path) -> list[tuple[object, ...]]:
         names = [row[0] for row in connection.execute(
             "SELECT name FROM sqlite_schema WHERE type = 'table' ORDER BY name"
         )]  # fmt: skip
-        anew = {"revisions", "map_format", "runs", "attempts", "hidden"}
+        anew = {"revisions", "map_format", "runs", "attempts", "hidden", "placements"}
         kept = [name for name in names if name not in anew]
         return [row for name in kept for row in connection.execute(f"SELECT * FROM {name}")]
 
@@ -48,7 +48,7 @@ def test_it_holds_the_same_and_answers_the_same(old: Path) -> None:
     before = rows_of(old)
     done = upgrade_map(old)
     assert (done.before, done.after, done.revisions) == (6, 7, 6)
-    assert done.after_bytes <= 1.3 * done.before_bytes  # each new index takes a page of it
+    assert done.after_bytes <= 1.33 * done.before_bytes  # each new index takes a page of it
     assert rows_of(old) == before
     assert check_file(old).problems == ()
     for at in range(1, 5):  # later ones hold the time at which they were made

@@ -98,7 +98,7 @@ def test_a_live_robot_is_found_by_its_fix(anchored: Path, street: Path, east_m: 
         for pair in open_drive(street, frames="5::2", recorded_at=START_NS)
     ]
     with open_map(anchored) as opened:
-        at_m = opened.frame.positions[len(opened.graph) // 2 :, 0].min() + east_m
+        at_m = opened.layout().positions[len(opened.graph) // 2 :, 0].min() + east_m
     fix = {"stamp_ns": frames[0].arrived.stamp_ns, "latitude_deg": 50.0, "sigma_m": 1.0}
     told = {**fix, "longitude_deg": 14.0 + at_m / METRES_PER_DEGREE}
     script = Script([Command("fix", told), Command("fix", {**told, "sigma_m": -1.0}), *frames])
@@ -129,7 +129,7 @@ def test_a_robot_without_recognition_is_found_by_its_fixes(
     live = open_drive(street, frames="5::2", recorded_at=START_NS)
     pairs = [(pair.stamp_ns, pair.left, pair.right) for pair in live]
     with open_map(anchored) as opened:
-        middle = opened.frame.positions[len(opened.graph) // 2 :, 0].min()
+        middle = opened.layout().positions[len(opened.graph) // 2 :, 0].min()
     drive = StereoBag(pairs, rectified_infos(live.camera))
     with bag(tmp_path / "drive", "mcap") as maker:
         for number, (stamp_ns, *images) in enumerate(pairs):

@@ -36,6 +36,7 @@ from engram.maps.rows import (
     Row,
     amendment_from_row,
     camera_from_row,
+    cell_of,
     check_tally,
     describe,
     edge_arrays,
@@ -533,6 +534,8 @@ def _check_removal(_: _Checking, row: Row) -> None:
 def _check_placement(_: _Checking, row: Row) -> None:
     pose = transform_from_bytes(row["map_from_node"], "the transform")
     _check_rotation(pose.rotation)
+    if row["cell"] != cell_of(pose):
+        raise MapCorruptError(f"it is filed in cell {row['cell']}, but lies in {cell_of(pose)}")
 
 
 def _check_goal(_: _Checking, row: Row) -> None:

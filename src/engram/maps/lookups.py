@@ -27,7 +27,9 @@ from engram.maps.map_frame import Moves, moves
 from engram.maps.marks import counting
 from engram.maps.reading import load_cameras
 from engram.maps.rows import (
+    CELL_M,
     Row,
+    cell_at,
     edges_from_rows,
     member,
     node_from_bytes,
@@ -53,7 +55,7 @@ from engram.maps.schema import (
 )
 from engram.maps.sqlite import SqliteDatabase
 from engram.maps.totals import own_rows, runs_of, state_at_head, totals_at
-from engram.maps.view import View, few, head
+from engram.maps.view import LARGEST_KEY, View, few, head
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,11 +272,53 @@ class Lookups:
             was, now = ({ids[key]: places[key] for key in before} for places in (before, after))
         return replace(moves(was, now, goals), of_nodes=of_nodes)
 
+    def is_empty(self) -> bool:
+        """Whether the map has no committed node."""
+        with self._database.reading() as connection:
+            return not totals_at(connection, self._view.at).nodes
+
+    def places(self, some: Iterable[NodeId]) -> dict[NodeId, SE3]:
+        """``map_from_node`` of those of some nodes that have a place."""
+        with self._database.reading() as connection:
+            keys = {row["key"]: row["uuid"] for row in self._named(connection, nodes, some)}
+            found = places_of(connection, self._view, keys)
+        return {node_from_bytes(keys[key]): pose for key, pose in found.items()}
+
+    def places_near(self, x_m: float, y_m: float, within_m: float) -> dict[NodeId, SE3]:
+        """``map_from_node`` of the nodes in a square of the map frame, and of some around it.
+
+        Args:
+            x_m, y_m: its middle.
+            within_m: half its side; infinite for all nodes.
+        """
+        with self._database.reading() as connection:
+            keys: set[int] = set()
+            for first, last in _strips(x_m, y_m, within_m):
+                placed = select(placements.c.node).where(placements.c.cell.between(first, last))
+                keys |= set(connection.execute(placed).scalars())
+            found = places_of(connection, self._view, keys)
+            ids: dict[int, NodeId] = {}
+            for part in few(sorted(found)):
+                query = self._view.select(nodes).where(nodes.c.key.in_(part))
+                for row in verified(nodes, connection.execute(query)):
+                    ids[row["key"]] = node_from_bytes(row["uuid"])
+        return {ids[key]: found[key] for key in sorted(found) if key in ids}
+
     def _named(self, connection: Connection, table: Table, some: Iterable[NodeId]) -> Iterator[Row]:
         """The visible rows of a table about some nodes, the newest last."""
         for part in few([one.bytes for one in some]):
             query = self._view.select(table).where(table.c.uuid.in_(part))
             yield from verified(table, connection.execute(query))
+
+
+def _strips(x_m: float, y_m: float, within_m: float) -> Iterator[tuple[int, int]]:
+    """First and last cell of each strip of cells along y that a square touches."""
+    if not np.isfinite(within_m):
+        yield 0, LARGEST_KEY
+        return
+    for strip in range(int(2 * within_m // CELL_M) + 2):
+        along_m = min(x_m - within_m + strip * CELL_M, x_m + within_m)
+        yield cell_at(along_m, y_m - within_m), cell_at(along_m, y_m + within_m)
 
 
 def node_records(connection: Connection, rows: Sequence[Row]) -> list[Node]:

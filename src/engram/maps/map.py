@@ -52,7 +52,7 @@ from engram.maps.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
 from engram.maps.hiding import Reverted, compare, hide_revision
 from engram.maps.laying_out import new_places
 from engram.maps.lookups import Lookups
-from engram.maps.map_frame import MapFrame, all_places, frame_of, graph_of
+from engram.maps.map_frame import Layout, MapFrame, all_places, frame_of, graph_of, layout_of
 from engram.maps.origins import Origin, origin_of
 from engram.maps.pages import MapPages
 from engram.maps.place_blocks import Parts, StoredBlocks, block_rows, write_block
@@ -443,7 +443,12 @@ class Map:
     def frame(self) -> MapFrame:
         """The map frame: where its nodes and goals lie, for messages, display and exports."""
         with reading_rows(self.location):
-            return self.derived(frame_of, self.revision, len(self.graph))
+            return self.derived(frame_of, self.revision)
+
+    def layout(self) -> Layout:
+        """The places of all nodes in the map frame: all of the map is read for it."""
+        with reading_rows(self.location):
+            return self.derived(layout_of)
 
     def grown_graph(self) -> ExperienceGraph | None:
         """The graph in memory if it has all nodes of the map; None if it would have to be read."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from engram.graph.placing import DEFAULT_CONFIG as PLACING
 from engram.graph.placing import PlacingConfig, Poses, place, replace_after_removal
 
 if TYPE_CHECKING:
+    from engram.maps.lookups import Lookups
     from engram.maps.map import Map
 
 
@@ -29,6 +31,9 @@ FARTHEST_M = 1e9
 # Directions in which a goal and the node that it is stored in may differ, before distance counts.
 _ALIKE_RAD = np.pi / 2
 _TURNED_AWAY_M = 5.0
+_KEPT = 1024
+# How far from a goal its node is looked for, one after another, metres.
+_WITHIN_M = (*(2.0**power for power in range(5, 13)), np.inf)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,34 +69,30 @@ class FramePose:
 
 
 class MapFrame:
-    """Where the nodes of a map lie: x, y horizontal and z up, metres.
+    """Where the nodes of a map lie: x, y horizontal and z up, metres; asked for some at a time.
 
     Nodes keep their place from one revision to the next, unless the map is anchored again or a
     repair shows that they were in a wrong place. Components whose relative pose is unknown stand
     side by side. Nothing localises by it.
 
     Args:
-        graph: the graph of the map.
-        poses: ``map_from_node`` by dense index.
+        lookups: questions to the map.
         origin: latitude and longitude of the frame's origin, degrees; None if unknown.
 
     Attributes:
-        poses, origin: as given.
+        origin: as given.
     """
 
-    def __init__(
-        self, graph: ExperienceGraph, poses: Poses, origin: tuple[float, float] | None = None
-    ) -> None:
-        self._graph = graph
-        self.poses = poses
+    def __init__(self, lookups: Lookups, origin: tuple[float, float] | None = None) -> None:
+        self._lookups = lookups
         self.origin = origin
-        ahead = poses.rotations[:, :2, 2]
-        self._yaws_rad = np.arctan2(ahead[:, 1], ahead[:, 0])
+        # A robot asks for the node where it is at each frame.
+        self._kept = lru_cache(maxsize=_KEPT)(self._read)
 
     @property
-    def positions(self) -> NDArray[np.float64]:
-        """(N, 3) float64, metres: the camera of each node, by dense index. Read-only."""
-        return self.poses.translations
+    def is_empty(self) -> bool:
+        """Whether no node has a place."""
+        return self._lookups.is_empty()
 
     def pose(self, node: NodeId) -> SE3:
         """``map_from_node``, the pose of a node's camera.
@@ -99,18 +100,17 @@ class MapFrame:
         Raises:
             InputError: the map has no such node.
         """
-        return self.poses.pose(self._graph.index(node))
+        found = self.find(node)
+        if found is None:
+            raise InputError(f"node {node} has no place in the map frame")
+        return found
 
     def find(self, node: NodeId) -> SE3 | None:
         """``map_from_node``; None for a node that has no place in the frame (yet)."""
-        at = self._graph.index(node) if node in self._graph else len(self.poses.translations)
-        return self.poses.pose(at) if at < len(self.poses.translations) else None
+        return self._kept(node)
 
-    def placements(self) -> list[Placement]:
-        """Where every node lies."""
-        return [
-            Placement(node.id, self.poses.pose(at)) for at, node in enumerate(self._graph.nodes)
-        ]
+    def _read(self, node: NodeId) -> SE3 | None:
+        return self._lookups.places([node]).get(node)
 
     def goal(self, x_m: float, y_m: float, yaw_rad: float, name: str = "") -> Goal:
         """A pose in the map frame as a goal, which stays valid when the frame moves.
@@ -126,22 +126,30 @@ class MapFrame:
         Raises:
             InputError: the map has no nodes, or a number is not finite or above `FARTHEST_M`.
         """
-        if not len(self._graph):
-            raise InputError("the map has no nodes: there is nothing to store a goal in")
         if not (np.abs((x_m, y_m, yaw_rad)) <= FARTHEST_M).all():
             raise InputError(
                 f"goal {name!r}: x {x_m:g}, y {y_m:g}, yaw {yaw_rad:g} must be finite, at most "
                 f"{FARTHEST_M:g}"
             )
-        offset = self.poses.translations[:, :2] - (x_m, y_m)
-        turned = np.abs(np.angle(np.exp(1j * (self._yaws_rad - yaw_rad))))
-        distance_m = np.hypot(*offset.T) + _TURNED_AWAY_M * (turned > _ALIKE_RAD)
-        at = int(np.argmin(distance_m))
-        turn = _about_vertical(yaw_rad - float(self._yaws_rad[at]))
-        height_m = float(self.poses.translations[at, 2])
-        map_from_goal = SE3(turn @ self.poses.rotations[at], np.array([x_m, y_m, height_m]))
-        node_from_goal = self.poses.pose(at).inverse() @ map_from_goal
-        return Goal(name, self._graph.node(at).id, node_from_goal)
+        for within_m in _WITHIN_M:
+            found = self._lookups.places_near(x_m, y_m, within_m)
+            if not found:
+                continue
+            poses = list(found.values())
+            ahead = np.array([pose.rotation[:2, 2] for pose in poses])
+            yaws_rad = np.arctan2(ahead[:, 1], ahead[:, 0])
+            away_m = np.array([pose.translation[:2] for pose in poses]) - (x_m, y_m)
+            turned = np.abs(np.angle(np.exp(1j * (yaws_rad - yaw_rad))))
+            distance_m = np.hypot(*away_m.T) + _TURNED_AWAY_M * (turned > _ALIKE_RAD)
+            at = int(np.argmin(distance_m))
+            if distance_m[at] <= within_m:  # beyond there may be a nearer one
+                break
+        else:
+            raise InputError("the map has no nodes: there is nothing to store a goal in")
+        turn = _about_vertical(yaw_rad - float(yaws_rad[at]))
+        height_m = float(poses[at].translation[2])
+        map_from_goal = SE3(turn @ poses[at].rotation, np.array([x_m, y_m, height_m]))
+        return Goal(name, list(found)[at], poses[at].inverse() @ map_from_goal)
 
     def locate(self, goal: Goal) -> FramePose:
         """Where a goal lies now.
@@ -165,10 +173,42 @@ class MapFrame:
         if self.origin is None:
             return []
         here = local_m(np.array([latitude_deg]), np.array([longitude_deg]), self.origin)[0]
-        away_m = np.linalg.norm(self.positions[:, :2] - here, axis=1)
-        order = np.argsort(away_m, kind="stable")
-        near = order[: int((away_m <= within_m).sum())]
-        return [self._graph.node(at).id for at in near.tolist()]
+        found = self._lookups.places_near(float(here[0]), float(here[1]), within_m)
+        away_m = {
+            node: float(np.linalg.norm(pose.translation[:2] - here)) for node, pose in found.items()
+        }
+        near = [node for node, far_m in away_m.items() if far_m <= within_m]
+        return sorted(near, key=away_m.__getitem__)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """The places of all nodes of a map in its frame.
+
+    Attributes:
+        graph: the graph of the map.
+        poses: ``map_from_node`` by dense index.
+    """
+
+    graph: ExperienceGraph
+    poses: Poses
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """(N, 3) float64, metres: the camera of each node, by dense index. Read-only."""
+        return self.poses.translations
+
+    def pose(self, node: NodeId) -> SE3:
+        """``map_from_node``, the pose of a node's camera.
+
+        Raises:
+            InputError: the map has no such node.
+        """
+        return self.poses.pose(self.graph.index(node))
+
+    def placements(self) -> list[Placement]:
+        """Where every node lies."""
+        return [Placement(node.id, self.poses.pose(at)) for at, node in enumerate(self.graph.nodes)]
 
 
 def local_m(
@@ -304,18 +344,22 @@ def _about_vertical(yaw_rad: float) -> NDArray[np.float64]:
 ORIGIN = "map_frame"
 
 
-def frame_of(store: Map, revision: int, nodes: int) -> MapFrame:
+def frame_of(store: Map, revision: int) -> MapFrame:
     """The map frame of an opened map; `Map.frame` shares it.
 
     Args:
         store: the map.
-        revision, nodes: of the map, for `Map.derived`: the frame changes with them.
+        revision: of the map, for `Map.derived`: the frame changes with it.
     """
-    del revision, nodes
-    graph = store.graph
+    del revision
     origin = store.statistics().get(ORIGIN)
     known = None if not origin else (origin["latitude_deg"], origin["longitude_deg"])
-    return MapFrame(graph, place(graph, store.placements), known)
+    return MapFrame(store.lookups, known)
+
+
+def layout_of(store: Map) -> Layout:
+    """The layout of an opened map, for `Map.derived`."""
+    return Layout(store.graph, place(store.graph, store.placements))
 
 
 def all_places(store: Map, contents: Mapping[str, float], config: PlacingConfig) -> list[Placement]:

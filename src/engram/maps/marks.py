@@ -23,6 +23,7 @@ from engram.graph.model import (
 from engram.maps.columns import Columns, read_columns
 from engram.maps.rows import (
     Row,
+    cell_of,
     checked_int,
     checked_text,
     node_from_bytes,
@@ -46,8 +47,11 @@ def mark_row(mark: Mark, key_of: Callable[[NodeId], int]) -> tuple[Table, Row]:
         InputError: a node is not in the map, or a value cannot be stored.
     """
     if isinstance(mark, Placement):
-        pose = transform_bytes(mark.map_from_node)
-        return placements, {"node": key_of(mark.node), "map_from_node": pose}
+        return placements, {
+            "node": key_of(mark.node),
+            "map_from_node": transform_bytes(mark.map_from_node),
+            "cell": cell_of(mark.map_from_node),
+        }
     if isinstance(mark, Goal):
         return goals, {
             "name": checked_text(mark.name, "name"),

@@ -192,6 +192,27 @@ def transforms_from_bytes(data: NDArray[np.uint8], named: Callable[[int], str]) 
     return [SE3(*both) for both in zip(rotations, translations, strict=True)]
 
 
+# Side of a cell of the map frame, metres, and how many of them lie on each side of the origin.
+CELL_M = 32.0
+_HALF = 2**30
+
+
+def cell_at(x_m: float, y_m: float) -> int:
+    """Number of the cell at a place of the map frame; neighbours along y have successive ones.
+
+    What lies beyond 2³⁵ m counts as at the border.
+    """
+    along, across = (
+        int(np.clip(np.floor(value_m / CELL_M), -_HALF, _HALF)) + _HALF for value_m in (x_m, y_m)
+    )
+    return (along << 32) + across
+
+
+def cell_of(map_from_node: SE3) -> int:
+    """Number of the cell in which a node lies."""
+    return cell_at(*map_from_node.translation[:2].tolist())
+
+
 def covariance_bytes(covariance: NDArray[np.float64]) -> bytes:
     """168 bytes: upper triangle of a (6, 6) covariance (m, rad), row by row, little-endian."""
     return _floats(covariance[_UPPER])

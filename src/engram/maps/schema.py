@@ -314,14 +314,17 @@ removals = _table(
     _int("removed_ns"),
 )
 
-# Where nodes lie in the map frame. Of one node's rows the newest counts.
+# Where nodes lie in the map frame. Of one node's rows the newest counts. Cells are of 32 m: see
+# `rows.cell_of`.
 placements = _table(
     "placements",
     _key(),
     _int("revision"),
     _int("node"),
     _transform("map_from_node"),
+    _int("cell"),
     Index("placements_by_node", "node"),
+    Index("placements_by_cell", "cell"),
 )
 
 # Known positions of nodes in the map frame. Those of the newest revision that has any count.

@@ -25,7 +25,15 @@ from engram.maps.changes import Changes
 from engram.maps.content import EMPTY_HASH, Identities, chained
 from engram.maps.counting import count_on
 from engram.maps.map_files import log_problems
-from engram.maps.rows import Row, from_json, sealed, to_json, verified
+from engram.maps.rows import (
+    Row,
+    cell_of,
+    from_json,
+    sealed,
+    to_json,
+    transform_from_bytes,
+    verified,
+)
 from engram.maps.runs import Runs, save_runs
 from engram.maps.schema import (
     FORMAT_VERSION,
@@ -35,6 +43,7 @@ from engram.maps.schema import (
     map_format,
     metadata,
     place_blocks,
+    placements,
     revisions,
     runs,
 )
@@ -43,10 +52,14 @@ from engram.maps.totals import Own, Totals
 from engram.maps.view import LARGEST_KEY, View
 from engram.sqlite import SqliteFile, is_full
 
-_NEW_COLUMNS = {revisions: ("ranges", "totals", "chain"), attempts: ("page",)}
+_NEW_COLUMNS = {
+    revisions: ("ranges", "totals", "chain"),
+    attempts: ("page",),
+    placements: ("cell",),
+}
 _NEW_TABLES = (runs, place_blocks)
 # Tables whose rows are written again, and what they are called meanwhile.
-_REWRITTEN = {table: f"{table.name}_6" for table in (revisions, attempts, hidden)}
+_REWRITTEN = {table: f"{table.name}_6" for table in (revisions, attempts, hidden, placements)}
 # How long to wait for a process that is just closing the map.
 _PATIENCE_MS = 1000
 
@@ -181,6 +194,9 @@ def _convert(connection: Connection, file: SqliteFile) -> int:
         connection.execute(text(f"ALTER TABLE {table.name} RENAME TO {name}"))
     metadata.create_all(connection)
     more = _copy_hidden(connection, _split_attempts(connection))
+    for row in _old_rows(connection, placements):
+        pose = transform_from_bytes(row["map_from_node"], f"placement {row['key']}")
+        connection.execute(insert(placements), sealed(placements, row | {"cell": cell_of(pose)}))
     for row in _old_rows(connection, revisions):
         row |= {"ranges": "{}", "totals": "{}", "chain": ""}
         if row["key"] in more:
@@ -329,7 +345,11 @@ def _compare(source: sqlite3.Connection, made: sqlite3.Connection) -> int:
     return compared
 
 
-_NOT_COMPARED = {revisions.name: {"checksum", "contents"}, hidden.name: {"key", "checksum"}}
+_NOT_COMPARED = {
+    revisions.name: {"checksum", "contents"},
+    hidden.name: {"key", "checksum"},
+    placements.name: {"checksum"},
+}
 
 
 _DRIVES = "SELECT DISTINCT revision, session FROM attempts ORDER BY revision, session"

@@ -28,12 +28,12 @@ from engram.frontend.matching import match_frames, pair_seed
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Anchor, Clock, Edge, EdgeKind, Goal, LandmarkSource, Node
 from engram.graph.placing import DEFAULT_CONFIG as PLACING
-from engram.graph.placing import Anchored, PlacingConfig, anchor
+from engram.graph.placing import Anchored, PlacingConfig, Poses, anchor
 from engram.localiser.acceptance import AcceptanceConfig
 from engram.localiser.relocalisation import Relocaliser, Suggested
 from engram.mapper.loops import edges_agree
 from engram.maps.map import Map
-from engram.maps.map_frame import FARTHEST_M, ORIGIN, MapFrame, Moves, changed, local_m, moves
+from engram.maps.map_frame import FARTHEST_M, ORIGIN, Layout, Moves, changed, local_m, moves
 from engram.monitor import QUIET, Monitor
 from engram.robot.localisers import DriveSequence, relocaliser_in
 from engram.robot.settings import Settings
@@ -442,13 +442,12 @@ def anchor_map(
             Anchor(node.id, float(x), float(y), one.z_m, one.sigma_m or usual, source.name)
             for node, one, (x, y) in zip(nodes, known, positions, strict=True)
         ]
-        frame = store.frame
-        before = {one.node: one.map_from_node for one in frame.placements()}
+        before = {one.node: one.map_from_node for one in store.layout().placements()}
         poses = anchor(store.graph, before, _anchored(store, anchors), placing)
-        after = MapFrame(store.graph, poses, origin)
+        after = Layout(store.graph, poses)
         residuals = _residuals(after, anchors)
         about = {"author": author, **_about(source, anchors)}
-        revision = None if dry_run else _write(store, anchors, after, about, placing)
+        revision = None if dry_run else _write(store, anchors, poses, origin, about, placing)
         places = {one.node: one.map_from_node for one in after.placements()}
         moved = moves(before, places, store.goals.values())
     outliers = tuple(
@@ -534,10 +533,10 @@ def _anchored(store: Map, anchors: list[Anchor]) -> Anchored:
     )
 
 
-def _residuals(frame: MapFrame, anchors: list[Anchor]) -> dict[str, float]:
+def _residuals(layout: Layout, anchors: list[Anchor]) -> dict[str, float]:
     return {
         str(anchor.node): float(
-            np.hypot(*(frame.pose(anchor.node).translation[:2] - (anchor.x_m, anchor.y_m)))
+            np.hypot(*(layout.pose(anchor.node).translation[:2] - (anchor.x_m, anchor.y_m)))
         )
         for anchor in anchors
     }
@@ -551,15 +550,15 @@ def _about(source: Path, anchors: list[Anchor]) -> dict[str, Any]:
 def _write(
     store: Map,
     anchors: list[Anchor],
-    frame: MapFrame,
+    poses: Poses,
+    origin: tuple[float, float] | None,
     about: dict[str, Any],
     placing: PlacingConfig,
 ) -> int:
-    origin = frame.origin
     with store.begin_revision(**about) as writer:
         for anchor in anchors:
             writer.add_mark(anchor)
-        for placement in changed(store.placements, store.graph, frame.poses, placing.same_m):
+        for placement in changed(store.placements, store.graph, poses, placing.same_m):
             writer.add_mark(placement)
         if origin is not None:
             body = {"latitude_deg": origin[0], "longitude_deg": origin[1]}
@@ -716,7 +715,7 @@ def join_islands(
     """Joins the parts of an anchored map that show the same places, in a revision of its own."""
     with Map.open(path, writes=True) as store:
         resolved = (settings or Settings()).for_descriptor(store.descriptor)
-        islands = _Islands(store.graph, store.frame, store.frames, resolved, config)
+        islands = _Islands(store.layout(), store.frames, resolved, config)
         edges = islands.edges(_sigmas_m(store), monitor)
         ids = tuple((str(edge.a), str(edge.b)) for edge in edges)
         if not edges:
@@ -749,16 +748,15 @@ class _Islands:
 
     def __init__(
         self,
-        graph: ExperienceGraph,
-        frame: MapFrame,
+        layout: Layout,
         frames: LandmarkSource,
         settings: Settings,
         config: IslandsConfig | None,
     ) -> None:
         self.compared = 0
-        self._graph, self._frames = graph, frames
-        self._places = frame.positions[:, :2]
-        self._ahead = np.array([frame.pose(node.id).rotation[:2, 2] for node in graph.nodes])
+        self._graph, self._frames = layout.graph, frames
+        self._places = layout.positions[:, :2]
+        self._ahead = layout.poses.rotations[:, :2, 2]
         self._matcher = settings.localiser.matcher
         self._acceptance: AcceptanceConfig = settings.localiser.acceptance
         self._config = config or IslandsConfig()

@@ -16,7 +16,7 @@ from engram.graph.model import Amendable, Node
 from engram.maps.history import stamp_text
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
-from engram.maps.map_frame import FramePose, MapFrame
+from engram.maps.map_frame import FramePose, Layout, MapFrame
 from engram.maps.schema import FORMAT_VERSION
 from engram.monitor import write_whole
 from engram.places.words import vocabulary_problems
@@ -182,7 +182,7 @@ def export_map(
     with Map.open(path, at=at) as store:
         place = {one: number for number, one in enumerate(store.sessions)}
         nodes = sorted(store.graph.nodes, key=lambda one: (place[one.session], one.stamp_ns))
-        text = FORMS[named](store, store.frame, nodes)
+        text = FORMS[named](store, store.layout(), nodes)
         goals = len(store.goals) if named in _WITH_GOALS else 0
     try:
         with write_whole(out) as draft:
@@ -192,11 +192,11 @@ def export_map(
     return Exported(len(nodes), goals)
 
 
-def _tum(store: Map, frame: MapFrame, nodes: list[Node]) -> str:
+def _tum(store: Map, layout: Layout, nodes: list[Node]) -> str:
     """Seconds, position, quaternion x y z w of ``map_from_camera``."""
     lines = ["# seconds x y z qx qy qz qw (map_from_camera, metres)"]
     for node in nodes:
-        pose = frame.pose(node.id)
+        pose = layout.pose(node.id)
         w, x, y, z = pose.quaternion_wxyz()
         stamp_ns = node.stamp_ns + store.sessions[node.session].shift_ns
         sign, (seconds, nanos) = "-" * (stamp_ns < 0), divmod(abs(stamp_ns), 1_000_000_000)
@@ -205,14 +205,14 @@ def _tum(store: Map, frame: MapFrame, nodes: list[Node]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _kitti(store: Map, frame: MapFrame, nodes: list[Node]) -> str:
+def _kitti(store: Map, layout: Layout, nodes: list[Node]) -> str:
     """The first three rows of each ``map_from_camera``."""
     del store
-    rows = (frame.pose(node.id).matrix()[:3].ravel() for node in nodes)
+    rows = (layout.pose(node.id).matrix()[:3].ravel() for node in nodes)
     return "".join(" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows)
 
 
-def _csv(store: Map, frame: MapFrame, nodes: list[Node]) -> str:
+def _csv(store: Map, layout: Layout, nodes: list[Node]) -> str:
     """A line for each node, then one for each goal."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -220,20 +220,20 @@ def _csv(store: Map, frame: MapFrame, nodes: list[Node]) -> str:
     writer.writerow(("what", "name", "session", "robot", "stamp_ns", *places))
     for node in nodes:
         session = store.sessions[node.session]
-        pose = FramePose.of(frame.pose(node.id))
+        pose = FramePose.of(layout.pose(node.id))
         row = ("node", node.id, session.id, session.robot, node.stamp_ns + session.shift_ns)
-        writer.writerow((*row, *pose.to_dict().values(), *_geographic(frame, pose)))
+        writer.writerow((*row, *pose.to_dict().values(), *_geographic(store.frame, pose)))
     for name, goal in sorted(store.goals.items()):
-        pose = frame.locate(goal)
+        pose = store.frame.locate(goal)
         writer.writerow(
-            ("goal", name, "", "", "", *pose.to_dict().values(), *_geographic(frame, pose))
+            ("goal", name, "", "", "", *pose.to_dict().values(), *_geographic(store.frame, pose))
         )
     return out.getvalue()
 
 
-def _geojson(store: Map, frame: MapFrame, nodes: list[Node]) -> str:
+def _geojson(store: Map, layout: Layout, nodes: list[Node]) -> str:
     """Points: the nodes, then the goals."""
-    if frame.origin is None:
+    if store.frame.origin is None:
         raise InputError(
             f"{store.location} has no known position on Earth: anchor it with latitudes and "
             "longitudes (engram anchor), or export CSV, which has metres"
@@ -243,9 +243,9 @@ def _geojson(store: Map, frame: MapFrame, nodes: list[Node]) -> str:
         session = store.sessions[node.session]
         stamp_ns = node.stamp_ns + session.shift_ns
         about = {"node": str(node.id), "robot": session.robot, "stamp_ns": stamp_ns}
-        features.append(_point(frame, FramePose.of(frame.pose(node.id)), about))
+        features.append(_point(store.frame, FramePose.of(layout.pose(node.id)), about))
     for name, goal in sorted(store.goals.items()):
-        features.append(_point(frame, frame.locate(goal), {"goal": name}))
+        features.append(_point(store.frame, store.frame.locate(goal), {"goal": name}))
     return json.dumps({"type": "FeatureCollection", "features": features}) + "\n"
 
 
@@ -264,7 +264,7 @@ def _geographic(frame: MapFrame, pose: FramePose) -> tuple[float | str, float | 
     return frame.geographic(pose.x_m, pose.y_m) or ("", "")
 
 
-FORMS: Mapping[str, Callable[[Map, MapFrame, list[Node]], str]] = {
+FORMS: Mapping[str, Callable[[Map, Layout, list[Node]], str]] = {
     "tum": _tum,
     "kitti": _kitti,
     "csv": _csv,

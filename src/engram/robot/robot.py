@@ -528,7 +528,7 @@ class DisplayPose:
         map_from_live = None
         if position is not None and map_from_node is not None:
             map_from_live = map_from_node @ position.node_from_live
-        elif result.saved is not None and not self._saved and not len(self._frame.positions):
+        elif result.saved is not None and not self._saved and self._frame.is_empty:
             map_from_live = SE3(MAP_FROM_CAMERA.copy(), np.zeros(3))
         if result.saved is not None and map_from_live is not None:
             self._saved[result.saved] = map_from_live

@@ -430,7 +430,7 @@ def plot_map(path: Path, out: Path, by: str = "experience", at: int | str | None
     """
     check_picture(out)
     with Map.open(path, at=at) as opened:
-        points = opened.frame.positions[:, :2]
+        points = opened.layout().positions[:, :2]
         labels = np.array([COLOURS[by](opened, node) for node in opened.graph.nodes], dtype=str)
         counts = Counter(labels.tolist())
         largest = {label for label, _ in counts.most_common(_NAMED)}
@@ -463,7 +463,7 @@ def draw_difference(map_path: Path, difference: MapDifference, path: Path) -> No
         (difference.before, difference.removed),
     ):
         with Map.open(map_path, at=revision) as opened:
-            points = opened.frame.positions[:, :2]
+            points = opened.layout().positions[:, :2]
             mask = np.array([node.id in changed for node in opened.graph.nodes], bool)
         drawn += [points[~mask], points[mask]]
     kept, added, _, removed = drawn

@@ -84,7 +84,7 @@ class Viewer:
         for node in opened.graph.nodes:
             numbers.setdefault(node.session, len(numbers))
         colours = [_hue(numbers[node.session]) for node in opened.graph.nodes]
-        points = self._rr.Points3D(opened.frame.positions, colors=colours, radii=0.3)
+        points = self._rr.Points3D(opened.layout().positions, colors=colours, radii=0.3)
         self._stream.log("map/nodes", points, static=True)
         goals = {name: opened.frame.locate(goal) for name, goal in opened.goals.items()}
         stars = self._rr.Points3D(

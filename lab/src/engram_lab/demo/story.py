@@ -143,7 +143,7 @@ def _experience_tracks(
     """Nodes of each session that are connected to the first node, in the map frame."""
     with Map.open(map_path) as opened:
         graph = opened.graph
-        tree, places_m = graph.chains_from(0), opened.frame.positions[:, :2]
+        tree, places_m = graph.chains_from(0), opened.layout().positions[:, :2]
         tracks = []
         for session in opened.sessions.values():
             number = graph.session_number(session.id)

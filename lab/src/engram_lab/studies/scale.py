@@ -60,7 +60,14 @@ from engram.maps.attempts import encode_words, pack
 from engram.maps.history import blame_node, map_log, show_revision
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
-from engram.maps.rows import camera_row, covariance_bytes, session_row, to_json, transform_bytes
+from engram.maps.rows import (
+    camera_row,
+    cell_of,
+    covariance_bytes,
+    session_row,
+    to_json,
+    transform_bytes,
+)
 from engram.maps.sqlite import SqliteDatabase
 from engram.maps.upgrading import complete_history
 from engram.odometry.step import OdometryStatus, OdometryStep
@@ -295,7 +302,9 @@ class _Rows:
         self._put(schema.words, node=key, vocabulary=hash_of(_vocabulary()), body=words)
         placed = {"key": self._next(schema.placements), "revision": revision, "node": key}
         pose = SE3(MAP_FROM_CAMERA.copy(), np.zeros(3)) @ city.pose(street, lane, metre)
-        self._put(schema.placements, **placed, map_from_node=transform_bytes(pose))
+        self._put(
+            schema.placements, **placed, map_from_node=transform_bytes(pose), cell=cell_of(pose)
+        )
         return key
 
     def _between_uncached(self, turned: int, lane_a: int, a: int, lane_b: int, b: int) -> bytes:

@@ -302,7 +302,7 @@ def picture_before_and_after(centre: Path, before: int, path: Path) -> None:
 
 
 def _tracks(opened: Map) -> list[Track]:
-    places_m = opened.frame.positions[:, :2]
+    places_m = opened.layout().positions[:, :2]
     robots = np.array([opened.sessions[node.session].robot for node in opened.graph.nodes], object)
     return [
         Track(f"{robot} ({int((robots == robot).sum())})", places_m[robots == robot])

@@ -595,7 +595,7 @@ def _frame_errors(path: Path, truths: dict[SessionId, Truth | None]) -> np.ndarr
         poses = {int(at): true.pose(store.graph.node(int(at)).id) for at in inside}
         known = [at for at, pose in poses.items() if pose is not None]
         places = np.array([pose.translation for pose in poses.values() if pose is not None])
-        laid = store.frame.positions[known]
+        laid = store.layout().positions[known]
     return np.asarray(np.linalg.norm((fit_level(laid, places) @ laid - places)[:, :2], axis=1))
 
 

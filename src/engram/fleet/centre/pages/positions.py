@@ -21,7 +21,7 @@ def drawn(path: Path, version: str, revision: int) -> bytes:
     """The nodes of a revision as JSON, in the map frame; kept by version."""
     del version  # names the revision permanently; after a restore the number alone does not
     with Map.open(path, at=revision) as store:
-        points = store.frame.positions
+        points = store.layout().positions
         sessions = list(store.sessions.values())
         place = {session.id: at for at, session in enumerate(sessions)}
         brought = _brought(path, revision)
