@@ -69,7 +69,7 @@ class FramePose:
 
 
 class MapFrame:
-    """Where the nodes of a map lie: x, y horizontal and z up, metres; asked for some at a time.
+    """Where the nodes of a map lie: x, y horizontal and z up, metres; read for some at a time.
 
     Nodes keep their place from one revision to the next, unless the map is anchored again or a
     repair shows that they were in a wrong place. Components whose relative pose is unknown stand

@@ -415,7 +415,7 @@ def drive_in(path: Path, city: City) -> dict[str, float]:
 
 
 def lost_in(path: Path, city: City) -> dict[str, float]:
-    """Opens the map and lets a robot find itself that knows no place."""
+    """Opens the map and lets a robot find itself without a known place."""
     before_mb, begun = resident_mb(), time.process_time()
     with Map.open(path) as opened, opened.robot(CAMERA) as robot:
         taken, found_at = [], None
@@ -432,7 +432,7 @@ def lost_in(path: Path, city: City) -> dict[str, float]:
 
 
 def map_in(path: Path, city: City) -> dict[str, float]:
-    """Maps a drive that knows half of its way, in a copy of the map."""
+    """Maps a drive of which half is new, in a copy of the map."""
     with TemporaryDirectory(dir=path.parent) as folder:
         shutil.copy(path, copied := Path(folder) / path.name)
         before_mb, begun = resident_mb(), time.process_time()
