@@ -21,7 +21,6 @@ from engram.files import Holder, WriterLock, map_path
 from engram.frontend.frame import DescriptorKind
 from engram.geometry.cameras import CameraId, StereoCamera
 from engram.geometry.se3 import SE3
-from engram.graph.basin import BasinCounts
 from engram.graph.clock import check_zone
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
@@ -153,11 +152,10 @@ class _Contents:
     graph: ExperienceGraph
     path_memory: PathMemory
     attempts: Attempts
-    basin_counts: BasinCounts
     last_iterations: Mapping[SessionId, int]
 
     @staticmethod
-    def of(contents: MapContents, basin_counts: BasinCounts) -> _Contents:
+    def of(contents: MapContents) -> _Contents:
         graph = graph_of(contents.nodes, contents.edges)
         path_memory = PathMemory(graph)
         path_memory.add_all(contents.path_entries)
@@ -165,7 +163,6 @@ class _Contents:
             graph,
             path_memory,
             contents.attempts,
-            basin_counts,
             contents.last_iterations(),
         )
 
@@ -387,11 +384,6 @@ class Map:
         Their sessions are positions in `sessions`, their nodes dense indices of `graph`.
         """
         return self._read_contents().attempts
-
-    @property
-    def basin_counts(self) -> BasinCounts:
-        """Counts of `attempts`, from which match basins are learnt."""
-        return self._read_contents().basin_counts
 
     @property
     def last_iterations(self) -> Mapping[SessionId, int]:
@@ -1107,7 +1099,7 @@ class Map:
             if self._contents is None:
                 with no_collections(), reading_rows(self.location):
                     found = self.load()
-                    self._contents = _Contents.of(found, self.totals().basin_counts)
+                    self._contents = _Contents.of(found)
                 # Attempts refer to sessions by position: both must be read together.
                 self.__dict__["sessions"] = {one.id: one for one in found.sessions}
             return self._contents

@@ -143,11 +143,6 @@ class Own:
         key = table.primary_key.columns[0]
         return key.between(first, last) & (table.c.revision == self.key)
 
-    def columns(self, connection: Connection, table: Table) -> Columns:
-        """Those of one table, verified."""
-        view, within = View(0, self.key), self.ranges.get(table.name, (0, -1))
-        return read_columns(connection, view, table, within=within)
-
 
 def own_rows(row: Row) -> Own:
     """The rows of a revision, given by its row.
