@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from engram.errors import MapCorruptError
 from engram.frontend.frame import BRIEF
 from engram.geometry.se3 import SE3
 from engram.graph import paths as path_memories
@@ -344,3 +345,19 @@ def test_lookups_say_what_a_revision_moved(town: Path) -> None:
 
 def _key(edge: Edge) -> tuple[object, object, EdgeKind]:
     return edge.a, edge.b, edge.kind
+
+
+def test_sessions_of_nodes_are_known_without_their_pages(
+    opened: Map, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paged = PagedGraph(opened.pages, 0)
+    expected = {one.id: one.session for one in opened.graph.nodes}
+    indices = {index: node for index, node in enumerate(paged.ids(0)) if node is not None}
+    with monkeypatch.context() as patched:
+        patched.setattr(PagedGraph, "_load_page", None)
+        assert {node: paged.session_of(at) for at, node in indices.items()} == expected
+    paged.node(next(iter(indices)))
+    assert {node: paged.session_of(at) for at, node in indices.items()} == expected
+    for unused in set(range(len(paged))) - set(indices):
+        with pytest.raises(MapCorruptError):
+            paged.session_of(unused)

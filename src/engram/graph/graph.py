@@ -611,6 +611,10 @@ class ExperienceGraph:
         """The session with a number."""
         return self._sessions[number]
 
+    def session_of(self, index: int) -> SessionId:
+        """The session that saved a node."""
+        return self._sessions[int(self._node_sessions.rows[index])]
+
     @property
     def driven_m(self) -> NDArray[np.float64]:
         """(N,) float64: odometry distance of each node from its session's start, metres. A view."""

@@ -120,6 +120,14 @@ class GraphPages(Protocol):
         """Dense index of a node; None if there is none."""
         ...
 
+    def session_of(self, index: int) -> SessionId:
+        """The session that saved a node, without reading its page.
+
+        Raises:
+            MapCorruptError: there is no such node.
+        """
+        ...
+
     def ids(self, first: int, end: int) -> Iterator[NodeId | None]:
         """The nodes from a dense index up to another one; None for one that belongs to no node."""
         ...
@@ -264,6 +272,12 @@ class PagedGraph(ExperienceGraph):
         if known is None:
             known = self._records[index] = self._record(index)
         return known
+
+    def session_of(self, index: int) -> SessionId:
+        """See `ExperienceGraph`; reads no page."""
+        if self._first_half.rows[index] == _core.NOT_LOADED:
+            return self._pages.session_of(index)
+        return super().session_of(index)
 
     def _find(self, node: NodeId) -> int | None:
         found = self._index.get(node)

@@ -589,10 +589,10 @@ class Localiser:
         relative to them is certain up to drift: a match with one of them is a loop or a look-alike,
         and loop closure requires a second match.
         """
-        node = self._graph.node(index)
-        if node.session != self._own_session:
+        if self._own_session is None or self._graph.session_of(index) != self._own_session:
             return False
-        return not own or node.driven_m > self._driven_m - self.config.own_exclusion_m
+        driven_m = self._graph.node(index).driven_m
+        return not own or driven_m > self._driven_m - self.config.own_exclusion_m
 
     def _predicted(self, neighbourhood: Neighbourhood, row: int) -> Candidate:
         index = int(neighbourhood.nodes[row])

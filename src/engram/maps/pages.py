@@ -135,6 +135,13 @@ class MapPages:
             return None
         return int(row[0]) - 1
 
+    def session_of(self, index: int) -> SessionId:
+        """See `GraphPages`."""
+        with reading_rows(self._database.name):
+            found = self._database.rows(_NODES, {"first": index + 1, "last": index + 1})
+            (row,) = verified(nodes, found)
+            return self.sessions[self._session_numbers[row["session"]]]
+
     def ids(self, first: int, end: int) -> Iterator[NodeId | None]:
         """See `GraphPages`."""
         for start in range(first, end, _MANY):
