@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.sparse.csgraph import dijkstra
 from tests.builders import map_simulated
 
 from engram.errors import ConfigError, InputError
@@ -23,6 +24,7 @@ from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Stock
 from engram.fleet.download.selections import SELECTIONS
+from engram.graph.model import path_id
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 
@@ -109,6 +111,30 @@ def test_every_mission_is_as_connected_as_the_fleet_map_and_says_what_it_did(
     elif place == "anywhere":
         assert widened is None
     assert check_file(out).problems == ()
+
+
+@pytest.mark.parametrize("margin_m", [0.1, 30.0])
+@pytest.mark.parametrize("place", ["route", "region"])
+def test_an_area_is_what_a_search_of_the_whole_map_finds_and_as_connected(
+    stock, monkeypatch, place, margin_m
+):
+    monkeypatch.setattr("engram.fleet.download.surroundings._MARGIN_M", margin_m)
+    options = options_of(stock, place, place, None)
+    links = stock.graph.lightest(lambda edge: max(edge.a_from_b.distance_m, 1e-3))
+    seeds = stock.on_path[path_id(stock.sessions[1].id)] if place == "route" else [5, -1]
+    lengths_m = links.matrix(len(stock))
+    starts = np.arange(len(stock))[seeds]
+    found_m = dijkstra(lengths_m, directed=False, indices=starts, min_only=True, limit=2.0)
+    around = Stock(stock.store, options)
+    expected = {stock.node_ids[at] for at in np.flatnonzero(np.isfinite(found_m))}
+    assert {around.node_ids[at] for at in np.flatnonzero(around.area)} == expected
+    assert len(around) < len(stock) or margin_m > 1 or place == "region"
+    labels, whole = around.graph.components(), stock.graph.components()
+    pairs = {
+        (int(labels[at]), int(whole[stock.index[around.node_ids[at]]]))
+        for at in np.flatnonzero(around.area)
+    }
+    assert len(pairs) == len({there for _, there in pairs})
 
 
 @pytest.mark.parametrize("policy", BY_TIME)

@@ -23,7 +23,7 @@ Indices = NDArray[np.int64]
 
 # Read around the area: more than twice the length of a short bridge.
 _MARGIN_M = 30.0
-_WIDER = 4.0
+_WIDER, _FARTHEST_M = 4.0, 1e6
 # Least length of an edge, so that nodes at one place are still a step apart.
 _LEAST_STEP_M = 1e-3
 
@@ -59,7 +59,7 @@ class Surroundings:
             radius_m: of the area, metres.
         """
         loaded: dict[int, GraphPage] = {}
-        margin_m, before = _MARGIN_M, -1
+        margin_m = _MARGIN_M
         while True:
             nodes, distance_m = _search(pages, loaded, seeds, radius_m + margin_m)
             here = Surroundings(
@@ -67,9 +67,9 @@ class Surroundings:
                 distance_m <= radius_m,
                 whole=False,
             )
-            if len(nodes) == before or here._is_connected_as(runs):
+            if margin_m > _FARTHEST_M or here._is_connected_as(runs):
                 return here
-            margin_m, before = _WIDER * margin_m, len(nodes)
+            margin_m *= _WIDER
 
     def _is_connected_as(self, runs: Runs) -> bool:
         """Whether the area's nodes are connected here if they are in the map."""
