@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import chain
 from typing import Any
 
-from sqlalchemy import Connection, Table, delete, func, select, update
+from sqlalchemy import Connection, Table, bindparam, delete, func, select, update
 
 from engram import __version__
 from engram.errors import MapCorruptError, RevisionError
@@ -53,6 +53,7 @@ _COUNTED = " UNION ALL ".join(
     for table in VERSIONED
     for key in [table.primary_key.columns[0].name]
 )
+_CHANGED = update(revisions).where(revisions.c.key == bindparam("which"))
 # Ranges of a revision without rows.
 _NOTHING = to_json({})
 
@@ -130,8 +131,7 @@ def revision_row(connection: Connection, key: int, status: RevisionStatus) -> Ro
 
 
 def _put(connection: Connection, row: Row) -> None:
-    sealed(revisions, row)
-    connection.execute(update(revisions).where(revisions.c.key == row["key"]).values(row))
+    connection.execute(_CHANGED, sealed(revisions, row) | {"which": row["key"]})
 
 
 def change_revision(
