@@ -30,7 +30,7 @@ from engram.graph.model import path_id
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.maps.rows import sealed
-from engram.maps.schema import edges, nodes, path_entries
+from engram.maps.schema import edges, nodes, path_entries, placements
 from engram.sqlite import SqliteFile
 
 from .frames import assert_same_landmarks
@@ -322,6 +322,16 @@ class TestCheckNamesTableUuidAndFact:
             "a revision that is not before its own"
         )
         assert expected in problems(broken)
+
+    def test_a_place_that_is_filed_elsewhere(self, broken):
+        with sqlite3.connect(broken) as connection:
+            connection.row_factory = sqlite3.Row
+            row = dict(connection.execute("SELECT * FROM placements WHERE key = 2").fetchone())
+        connection.close()
+        change(broken, "DELETE FROM placements WHERE key = 2")
+        insert_row(broken, placements, {**row, "cell": row["cell"] + 1})
+        (problem,) = problems(broken)
+        assert problem.startswith(f"placements row 2: it is filed in cell {row['cell'] + 1}")
 
     def test_a_uuid_that_is_none(self, broken):
         row = {

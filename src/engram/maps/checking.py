@@ -36,6 +36,7 @@ from engram.maps.rows import (
     Row,
     amendment_from_row,
     camera_from_row,
+    cell_at,
     cell_of,
     check_tally,
     describe,
@@ -601,7 +602,12 @@ def _are_path_entries(found: Columns) -> bool:
 
 
 def _are_placements(found: Columns) -> bool:
-    return _are_rotations(found["map_from_node"].view("<f8"))
+    transforms = found["map_from_node"].view("<f8")
+    if not _are_rotations(transforms):
+        return False
+    places = zip(transforms[:, 9].tolist(), transforms[:, 10].tolist(), strict=True)
+    cells = [cell_at(*place) for place in places]
+    return bool(np.array_equal(found["cell"], cells))
 
 
 def _are_rotations(transforms: NDArray[np.float64]) -> bool:

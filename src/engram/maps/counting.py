@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, func, select
 
 from engram.errors import MapCorruptError
 from engram.geometry.cameras import CameraId
@@ -15,8 +15,8 @@ from engram.graph.basin import BasinCounts
 from engram.graph.graph import labels_of
 from engram.graph.model import EdgeKind
 from engram.maps.attempts import page_of
-from engram.maps.changes import Changes, Touched, columns_of, rows_within
-from engram.maps.columns import Columns, stretches
+from engram.maps.changes import Changes, Touched, columns_of, rows_by, rows_within
+from engram.maps.columns import Columns, Visible, stretches
 from engram.maps.marks import without_removed
 from engram.maps.reading import descriptor_of, load_cameras
 from engram.maps.records import MapInfo
@@ -39,7 +39,6 @@ from engram.maps.totals import (
     count_all,
     greater_m,
     joints,
-    right_m_of,
     state_at_head,
     totals_at,
     with_edges,
@@ -117,7 +116,7 @@ def count_on(
         path_entries=before.path_entries + _more(changes[path_entries]),
         attempts=before.attempts + _more(changes[attempts], "count"),
         forward={camera: shift for camera, shift in found.forward.items() if camera in cameras},
-        right_m=_right_m(connection, view, before, changes[placements]),
+        right_m=_right_m(connection, before, changes[placements], changes.after),
     )
     after = _parted(connection, runs, changes, owners)
     after = after.with_nodes(fresh["key"]).joined(*joints(changes[edges].gained, owners))
@@ -196,13 +195,34 @@ def _is_used(connection: Connection, view: View, camera: int) -> bool:
     return any(connection.execute(query.limit(1)).first() is not None for query in queries)
 
 
-def _right_m(connection: Connection, view: View, before: Totals, placed: Touched) -> float | None:
-    """The largest x of a place; read from all places where the rightmost one goes."""
+def _right_m(
+    connection: Connection, before: Totals, placed: Touched, shown: Visible
+) -> float | None:
+    """The largest x of a place."""
     lost, gained = (one["map_from_node"].view("<f8")[:, 9] for one in (placed.lost, placed.gained))
     known = before.right_m
     if known is not None and len(lost) and lost.max() >= known > gained.max(initial=-np.inf):
-        return right_m_of(connection, view)
+        return _rightmost_m(connection, shown)
     return greater_m(known, gained)
+
+
+def _rightmost_m(connection: Connection, shown: Visible) -> float | None:
+    """The largest x of a place, metres: the strips of cells are read from the right."""
+    beyond = 2**63 - 1
+    while True:
+        query = select(func.max(placements.c.cell)).where(placements.c.cell < beyond)
+        top = connection.execute(query).scalar()
+        if top is None:
+            return None
+        beyond = top >> 32 << 32
+        held = columns_of(placements, rows_within(connection, placements, "cell", (beyond, top)))
+        at = rows_by(connection, placements, "node", held["node"])  # which may lie elsewhere now
+        found = columns_of(placements, at.values())
+        found = found.rows(np.flatnonzero(shown.shows(placements, found)))
+        found = shown.in_history(found).newest("node")
+        here = found["map_from_node"].view("<f8")[found["cell"] >= beyond, 9]
+        if len(here):
+            return float(here.max())
 
 
 def _parted(connection: Connection, runs: Runs, changes: Changes, owners: Owners) -> Runs:

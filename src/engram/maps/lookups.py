@@ -55,7 +55,7 @@ from engram.maps.schema import (
 )
 from engram.maps.sqlite import SqliteDatabase
 from engram.maps.totals import own_rows, runs_of, state_at_head, totals_at
-from engram.maps.view import LARGEST_KEY, View, few, head
+from engram.maps.view import View, few, head
 
 
 @dataclass(frozen=True, slots=True)
@@ -314,7 +314,7 @@ class Lookups:
 def _strips(x_m: float, y_m: float, within_m: float) -> Iterator[tuple[int, int]]:
     """First and last cell of each strip of cells along y that a square touches."""
     if not np.isfinite(within_m):
-        yield 0, LARGEST_KEY
+        yield 0, 2**63 - 1  # those with x >= 0 are beyond the largest key
         return
     for strip in range(int(2 * within_m // CELL_M) + 2):
         along_m = min(x_m - within_m + strip * CELL_M, x_m + within_m)

@@ -184,7 +184,7 @@ def count_all(connection: Connection, view: View) -> tuple[Totals, Runs]:
         paths=_count(connection, view.select(paths)),
         path_entries=_count(connection, places),
         attempts=int(connection.execute(seen).scalar() or 0),
-        right_m=right_m_of(connection, view),
+        right_m=_right_m(connection, view),
     )
     found, runs = _count_graph(connection, view, found)
     return found.with_basin(_basin(connection, view, runs)), runs
@@ -385,7 +385,7 @@ def supersedes(connection: Connection, view: View, own: Own) -> bool:
     return False
 
 
-def right_m_of(connection: Connection, view: View) -> float | None:
+def _right_m(connection: Connection, view: View) -> float | None:
     """The largest x of the newest place of each node, metres, from all places."""
     parts = [
         (part["node"], part["revision"], part["key"], part["map_from_node"].view("<f8")[:, 9])
