@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from uuid import UUID
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from engram.graph.model import (
     EdgeKind,
     Goal,
     Node,
+    NodeId,
     PathEntry,
     PathEntryKind,
     Removal,
@@ -361,3 +363,35 @@ def test_sessions_of_nodes_are_known_without_their_pages(
     for unused in set(range(len(paged))) - set(indices):
         with pytest.raises(MapCorruptError):
             paged.session_of(unused)
+
+
+def test_places_in_columns_are_those_of_the_records(opened: Map) -> None:
+    placed = opened.placed()
+    numbers = {one.number for one in opened.log()}
+    assert set(placed.revision.tolist()) <= numbers
+    found = dict(
+        zip((uuid.tobytes() for uuid in placed.uuids), placed.positions.tolist(), strict=True)
+    )
+    expected = {node.bytes: pose.translation.tolist() for node, pose in opened.placements.items()}
+    assert found == expected
+    for uuid, number, stamp_ns in zip(
+        placed.uuids, placed.session.tolist(), placed.stamp_ns.tolist(), strict=True
+    ):
+        record = opened.graph.node(opened.graph.index(NodeId(UUID(bytes=uuid.tobytes()))))
+        assert (record.session, record.stamp_ns) == (placed.sessions[number].id, stamp_ns)
+
+
+def test_a_goal_is_stored_in_the_nearest_node_that_looks_its_way(opened: Map) -> None:
+    layout, rng = opened.layout(), np.random.default_rng(4)
+    ahead = layout.poses.rotations[:, :2, 2]
+    yaws_rad = np.arctan2(ahead[:, 1], ahead[:, 0])
+    for _ in range(20):
+        x_m, y_m, yaw_rad = rng.uniform([-400, -400, -3], [400, 400, 3])
+        goal = opened.frame.goal(x_m, y_m, yaw_rad)
+        turned = np.abs(np.angle(np.exp(1j * (yaws_rad - yaw_rad)))) > np.pi / 2
+        away_m = np.hypot(*(layout.positions[:, :2] - (x_m, y_m)).T) + 5.0 * turned
+        assert away_m[layout.graph.index(goal.node)] == away_m.min()
+        here = opened.frame.locate(goal)
+        assert (here.x_m, here.y_m) == pytest.approx((x_m, y_m), abs=1e-6)
+        near = {node for node in opened.placements if opened.frame.find(node) is not None}
+        assert goal.node in near

@@ -55,6 +55,7 @@ from engram.maps.map_frame import Layout, MapFrame, all_places, frame_of, graph_
 from engram.maps.origins import Origin, origin_of
 from engram.maps.pages import MapPages
 from engram.maps.place_blocks import Parts, StoredBlocks, block_rows, write_block
+from engram.maps.placed import PlacedNodes, load_placed
 from engram.maps.records import (
     CheckReport,
     InterruptedSession,
@@ -436,6 +437,10 @@ class Map:
         """The map frame: where its nodes and goals lie, for messages, display and exports."""
         with reading_rows(self.location):
             return self.derived(frame_of, self.revision)
+
+    def placed(self) -> PlacedNodes:
+        """All nodes that have a place in the map frame, in columns."""
+        return self._read(load_placed)
 
     def layout(self) -> Layout:
         """The places of all nodes in the map frame: all of the map is read for it."""

@@ -195,12 +195,12 @@ def _count_graph(connection: Connection, view: View, before: Totals) -> tuple[To
     found = before
     known = [
         (part["key"], part["session"], part["camera"])
-        for part in _stretches(connection, view, nodes)
+        for part in read_in_stretches(connection, view, nodes)
     ]
     owners = Owners(connection, *(np.concatenate(part) for part in zip(*known, strict=True)))
     runs = Runs.of(owners.nodes)
     skipped = np.array(sorted(_uncounted(connection, view)), np.int64)
-    for stretch in _stretches(connection, view, edges):
+    for stretch in read_in_stretches(connection, view, edges):
         part = stretch.rows(np.flatnonzero(~np.isin(stretch["key"], skipped)))
         found, runs = with_edges(found, part, owners), runs.joined(*joints(part, owners))
     return found.of_runs(runs), runs
@@ -329,7 +329,7 @@ def _are_steps(added: Columns) -> NDArray[np.bool_]:
     return np.isin(codes, [at for at, text in enumerate(texts) if text == EdgeKind.ODOMETRY])
 
 
-def _stretches(connection: Connection, view: View, table: Table) -> Iterator[Columns]:
+def read_in_stretches(connection: Connection, view: View, table: Table) -> Iterator[Columns]:
     """The visible rows of a table by key, so many at once; one stretch at least."""
     key = table.primary_key.columns[0]
     last = connection.execute(select(func.max(key))).scalar() or 0
@@ -389,7 +389,7 @@ def _right_m(connection: Connection, view: View) -> float | None:
     """The largest x of the newest place of each node, metres, from all places."""
     parts = [
         (part["node"], part["revision"], part["key"], part["map_from_node"].view("<f8")[:, 9])
-        for part in _stretches(connection, view, placements)
+        for part in read_in_stretches(connection, view, placements)
     ]
     node, revision, key, x_m = (np.concatenate(one) for one in zip(*parts, strict=True))
     place_of = places_in_history(connection)

@@ -21,12 +21,13 @@ from engram.files import check_output
 from engram.frontend.features import match_sides
 from engram.frontend.frame import Frame, StereoPair
 from engram.graph.clock import hour_of_day
-from engram.graph.model import Clock, Node, Session
+from engram.graph.model import Clock, Session
 from engram.localiser.attempts import Outcome, outcome_at
 from engram.localiser.localisation import Localisation
 from engram.maps.difference import MapDifference
 from engram.maps.frame_reader import FrameReader
 from engram.maps.map import Map
+from engram.maps.placed import PlacedNodes
 from engram.robot.robot import LastFrame
 from engram.untrusted import printable
 
@@ -385,33 +386,46 @@ _NAMED = 12
 _FEW = "0.7"
 
 
-def _experience(opened: Map, node: Node) -> str:
-    session = opened.sessions[node.session]
+def _by_session(placed: PlacedNodes, label: Callable[[Session], str]) -> list[str]:
+    labels = [label(session) for session in placed.sessions]
+    return [labels[number] for number in placed.session.tolist()]
+
+
+def _drive(session: Session) -> str:
     if session.clock is Clock.UTC:
         start = datetime.fromtimestamp(session.start_ns / 1e9, UTC)
         return f"{session.robot}, {start:%Y-%m-%d %H:%M}"
     return f"{session.robot}, {str(session.id)[:8]}"
 
 
-def _hour(opened: Map, node: Node) -> str:
-    session: Session = opened.sessions[node.session]
-    hour = hour_of_day(session, node.stamp_ns)
-    return "hour unknown" if hour is None else f"{int(hour):02d} h"
+def _experiences(placed: PlacedNodes) -> list[str]:
+    return _by_session(placed, _drive)
 
 
-def _revision(opened: Map, node: Node) -> str:
-    return f"revision {opened.origin(str(node.id)).brought:3d}"
+def _hours(placed: PlacedNodes) -> list[str]:
+    # Within a second the hour of a drive is looked up once.
+    seconds = np.stack([placed.session, placed.stamp_ns // 1_000_000_000], axis=1)
+    times, which = np.unique(seconds, axis=0, return_inverse=True)
+    labels = []
+    for session, second in times.tolist():
+        hour = hour_of_day(placed.sessions[session], second * 1_000_000_000)
+        labels.append("hour unknown" if hour is None else f"{int(hour):02d} h")
+    return [labels[at] for at in which.ravel().tolist()]
 
 
-def _robot(opened: Map, node: Node) -> str:
-    return opened.sessions[node.session].robot
+def _revisions(placed: PlacedNodes) -> list[str]:
+    return [f"revision {number:3d}" for number in placed.revision.tolist()]
 
 
-COLOURS: Mapping[str, Callable[[Map, Node], str]] = {
-    "experience": _experience,
-    "hour": _hour,
-    "revision": _revision,
-    "robot": _robot,
+def _robots(placed: PlacedNodes) -> list[str]:
+    return _by_session(placed, lambda session: session.robot)
+
+
+COLOURS: Mapping[str, Callable[[PlacedNodes], list[str]]] = {
+    "experience": _experiences,
+    "hour": _hours,
+    "revision": _revisions,
+    "robot": _robots,
 }
 
 
@@ -430,8 +444,8 @@ def plot_map(path: Path, out: Path, by: str = "experience", at: int | str | None
     """
     check_picture(out)
     with Map.open(path, at=at) as opened:
-        points = opened.layout().positions[:, :2]
-        labels = np.array([COLOURS[by](opened, node) for node in opened.graph.nodes], dtype=str)
+        placed = opened.placed()
+        points, labels = placed.positions[:, :2], np.array(COLOURS[by](placed), dtype=str)
         counts = Counter(labels.tolist())
         largest = {label for label, _ in counts.most_common(_NAMED)}
         tracks = [
@@ -463,8 +477,9 @@ def draw_difference(map_path: Path, difference: MapDifference, path: Path) -> No
         (difference.before, difference.removed),
     ):
         with Map.open(map_path, at=revision) as opened:
-            points = opened.layout().positions[:, :2]
-            mask = np.array([node.id in changed for node in opened.graph.nodes], bool)
+            placed = opened.placed()
+            points, ids = placed.positions[:, :2], {node.bytes for node in changed}
+            mask = np.array([uuid.tobytes() in ids for uuid in placed.uuids], bool)
         drawn += [points[~mask], points[mask]]
     kept, added, _, removed = drawn
     tracks = [

@@ -75,6 +75,7 @@ from engram.places.vocabulary import Vocabulary, default_vocabulary, hash_of
 from engram.places.words import NodeWords
 from engram.robot.inspecting import describe_map
 from engram.sequences.sequence import LoggedFrame
+from engram.viewing.pictures import plot_map
 from engram_lab.synthetic_places import (
     CAMERA,
     DESCRIPTOR,
@@ -507,6 +508,8 @@ def ask(path: Path, city: City) -> dict[str, float]:
             "info": lambda: describe_map(path),
             "log": lambda: map_log(path),
             "show NODE": lambda: blame_node(path, node),
+            "goal": lambda: _goal_in(path, city),
+            "plot": lambda: _plot(path),
         }
     )
 
@@ -637,6 +640,18 @@ def download_in(path: Path, city: City) -> dict[str, float]:
             found[f"download {name} (s)"] = time.process_time() - begun
             (Path(folder) / "out.engram").unlink()
     return found | {"downloads, peak (MB)": peak_mb() - before_mb}
+
+
+def _goal_in(path: Path, city: City) -> None:
+    """Finds the node for a goal on the driven street."""
+    x_m, y_m, _ = MAP_FROM_CAMERA @ city.pose(city.driven, 1, 10).translation
+    with Map.open(path) as opened:
+        opened.frame.goal(float(x_m), float(y_m), 0.0)
+
+
+def _plot(path: Path) -> None:
+    with TemporaryDirectory() as folder:
+        plot_map(path, Path(folder) / "plot.png")
 
 
 MEASURES: Mapping[str, Callable[[Path, City], dict[str, float]]] = {

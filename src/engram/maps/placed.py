@@ -1,0 +1,98 @@
+"""All nodes of a map with their places, for plots and pages: columns, no record of any node."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection
+
+from engram.errors import MapCorruptError
+from engram.graph.model import Session
+from engram.maps.reading import load_cameras, sessions_by_key
+from engram.maps.schema import nodes, placements
+from engram.maps.totals import read_in_stretches
+from engram.maps.view import View, places_in_history
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedNodes:
+    """The N nodes that have a place in the map frame, in the order of saving, a struct of arrays.
+
+    Attributes:
+        sessions: the drives of the map.
+        uuids: (N, 16) uint8.
+        session: (N,) int64, place in `sessions`.
+        stamp_ns: (N,) int64.
+        revision: (N,) int64, number of the revision that brought each; 0 of an open one.
+        positions: (N, 3) float64, metres in the map frame.
+    """
+
+    sessions: Sequence[Session]
+    uuids: NDArray[np.uint8]
+    session: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64]
+    revision: NDArray[np.int64]
+    positions: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.session)
+
+
+def load_placed(connection: Connection, view: View) -> PlacedNodes:
+    """The placed nodes of a view, read in stretches.
+
+    Raises:
+        MapCorruptError: a row is damaged.
+    """
+    known = sessions_by_key(connection, view, load_cameras(connection))
+    numbers = places_in_history(connection)
+    names = ("key", "uuid", "session", "stamp_ns", "revision")
+    parts = [
+        tuple(part[name] for name in names) for part in read_in_stretches(connection, view, nodes)
+    ]
+    keys, uuids, owners, stamps, revisions = map(np.concatenate, zip(*parts, strict=True))
+    order = np.argsort(keys)
+    at, positions = _newest_places(connection, view, keys[order])
+    chosen = order[at]
+    session_keys = np.array(sorted(known), np.int64)
+    session = np.searchsorted(session_keys, owners[chosen])
+    if len(chosen) and not np.isin(owners[chosen], session_keys).all():
+        raise MapCorruptError("table nodes: a node's session is missing; run engram check")
+    in_order = {key: number for number, key in enumerate(known)}
+    to_place = np.array([in_order[key] for key in session_keys.tolist()], np.int64)
+    brought, which = np.unique(revisions[chosen], return_inverse=True)
+    number_of = np.array([numbers[key] for key in brought.tolist()], np.int64)
+    return PlacedNodes(
+        tuple(known.values()),
+        uuids[chosen],
+        to_place[session],
+        stamps[chosen],
+        number_of[which],
+        positions,
+    )
+
+
+def _newest_places(
+    connection: Connection, view: View, keys: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Rows of those of the (N,) ascending keys that have a place, and the (P, 3) places, metres."""
+    numbers = places_in_history(connection)
+    positions = np.full((len(keys), 3), np.nan)
+    placed_by = np.full(len(keys), -1, np.int64)
+    for part in read_in_stretches(connection, view, placements):
+        row = np.searchsorted(keys, part["node"])
+        held = np.flatnonzero(row < len(keys))
+        held = held[keys[row[held]] == part["node"][held]]
+        brought = np.array([numbers[key] for key in part["revision"][held].tolist()], np.int64)
+        # Of one node's rows the newest revision counts, and of its rows the last: so does the last
+        # value that is assigned to one index.
+        order = np.argsort(brought, kind="stable")
+        order = order[brought[order] >= placed_by[row[held[order]]]]
+        at = row[held[order]]
+        placed_by[at] = brought[order]
+        positions[at] = part["map_from_node"][held[order]].view("<f8")[:, 9:]
+    found = np.flatnonzero(placed_by >= 0)
+    return found, positions[found]
