@@ -102,6 +102,28 @@ def test_parts_that_nothing_joins_stand_beside_the_others(town: Town, calls: lis
     assert calls == [True] * 4
 
 
+@pytest.mark.parametrize("kind", [*KINDS, EdgeKind.ODOMETRY])
+def test_measurements_made_again_move_nothing_but_steps_may(
+    town: Town, calls: list[bool], kind: EdgeKind
+) -> None:
+    town.drive("robot-1", 12)
+    town.drive("robot-2", 12, ("robot-1", "robot-1"), gap=7)
+    drive, town.lanes["robot-3"] = session("robot-3"), 2
+    with begin(town.store, drive) as writer:
+        for at in range(9):
+            writer.add_node(node(drive, at), node_frame(drive, at))
+            if at:
+                writer.add_edge(town.edge(("robot-3", at - 1), ("robot-3", at), EdgeKind.ODOMETRY))
+            if at % 3 == 0:
+                writer.add_edge(town.edge(("robot-1", at), ("robot-3", at), EdgeKind.MATCH))
+                again = (("robot-1", at), ("robot-2", at))
+                if kind is EdgeKind.ODOMETRY:
+                    again = (("robot-1", at), ("robot-1", at + 1))
+                writer.add_edge(town.edge(*again, kind))
+        writer.commit()
+    assert calls == [True, True, kind is not EdgeKind.ODOMETRY]
+
+
 def test_what_comes_together_is_laid_out_with_the_whole_map(town: Town, calls: list[bool]) -> None:
     town.drive("robot-1", 8)
     town.drive("robot-2", 6)

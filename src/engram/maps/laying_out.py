@@ -14,7 +14,7 @@ from engram.maps.map_frame import changed, graph_of
 from engram.maps.rows import Row, edges_from_rows, verified
 from engram.maps.runs import Keys, Runs
 from engram.maps.schema import edges, nodes
-from engram.maps.totals import Own, Totals, state_at_head, supersedes
+from engram.maps.totals import Own, Totals, changes_steps, state_at_head
 from engram.maps.view import View, few, places_in_history
 
 
@@ -41,7 +41,7 @@ def new_places(
     if any(contents[name] for name in ("placements", "hidden", "removals")):
         return None
     totals, runs = state_at_head(connection, view.at)
-    if runs is None or supersedes(connection, view, own):
+    if runs is None or changes_steps(connection, view, own):
         return None
     fresh, joins = (
         list(verified(table, connection.execute(query.order_by(table.c.key))))

@@ -364,18 +364,18 @@ def _both_ways(row: Row) -> tuple[tuple[int, int], tuple[int, int]]:
     return (row["a"], row["b"]), (row["b"], row["a"])
 
 
-def supersedes(connection: Connection, view: View, own: Own) -> bool:
-    """Whether a row of a revision may take the place of one of `view`, or is removed there."""
+def changes_steps(connection: Connection, view: View, own: Own) -> bool:
+    """Whether an edge of a revision replaces odometry of `view`, or is removed there.
+
+    Another measurement between nodes that have a place, of any other kind, moves none of them.
+    """
     older = select(revisions.c.key).where(revisions.c.number <= view.at)
-    for table, names in ((edges, ("a", "b", "kind")), (path_entries, ("path", "sequence"))):
-        if table.name not in own.ranges:
-            continue
-        other = table.alias()
-        same = and_(*(other.c[name] == table.c[name] for name in names))
-        query = select(other.c.key).select_from(table.join(other, same))
-        query = query.where(own.rows(table), other.c.revision.in_(older)).limit(1)
-        if connection.execute(query).first() is not None:
-            return True
+    other = edges.alias()
+    same = and_(*(other.c[name] == edges.c[name] for name in ("a", "b", "kind")))
+    query = select(other.c.key).select_from(edges.join(other, same))
+    replaced = query.where(own.rows(edges), edges.c.kind == str(EdgeKind.ODOMETRY))
+    if connection.execute(replaced.where(other.c.revision.in_(older)).limit(1)).first() is not None:
+        return True
     removed = select(removals.c.a, removals.c.b).where(removals.c.revision.in_(older))
     ends = [(row.a, row.b) for row in connection.execute(removed.order_by(removals.c.key))]
     for a, b in {*ends, *((b, a) for a, b in ends)}:
