@@ -19,7 +19,7 @@ from engram.errors import ConfigError
 from engram.frontend.frame import StereoPair
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
-from engram_lab.roads.distance import load_clip
+from engram_lab.roads.clips import load_clip, noise_of, spectrum_of
 from engram_lab.roads.matching import Answer, Answers, Mapped, distinct, resected
 from engram_lab.roads.odometry import motion, tracked
 from engram_lab.roads.seasons import shares
@@ -122,6 +122,20 @@ def test_shares_are_compared_over_the_same_places():
     assert change == pytest.approx(-15)
     paired = 100 * np.std(near.astype(float) - base) / np.sqrt(40)
     assert deviation == pytest.approx(paired, rel=0.1)
+
+
+def test_noise_and_spectrum_are_those_that_were_made():
+    rng = np.random.default_rng(3)
+    plane = np.add.outer(np.linspace(60, 120, 256), np.linspace(0, 40, 256))
+    noisy = (plane + rng.normal(0, 2.5, plane.shape)).astype(np.float32)
+    # The half that looks smoothest holds a little less of it.
+    assert noise_of(noisy) == pytest.approx(2.5 * 0.9, rel=0.1)
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(256), np.fft.fftfreq(256)))
+    frequency[0, 0] = 1
+    phases = np.fft.fft2(rng.normal(size=(256, 256)))
+    for slope in (-1.0, -1.5):
+        image = np.fft.ifft2(phases * frequency**slope).real.astype(np.float32)
+        assert spectrum_of(image) == pytest.approx(slope, abs=0.15)
 
 
 class _Asked(Mapped):
