@@ -88,7 +88,7 @@ class Weather:
         fog_per_m: extinction of the air.
         rain_mm_h: that falls; `changes` makes it come and go.
         wet: film of water on the ground, 0…1.
-        snow: how much lies; half of open ground is covered from 0.3, all of it from 0.5.
+        snow: how much lies; thin at 0.3, where wheels and patches show the ground; all from 0.5.
     """
 
     cloud: float = 0.0
