@@ -149,6 +149,16 @@ STEP = st.tuples(
     + [("measure", 1, 0)] * 2,
     pair=(0, 0),
 )
+# A revert is taken back whose session a later one has hidden.
+@example(
+    steps=[
+        ("drive", 31, 29),
+        ("revert", 0, 0),
+        ("drive", 16, 0),
+        *[("revert", at, 0) for at in (0, 29)],
+    ],
+    pair=(0, 4),
+)
 @given(steps=st.lists(STEP, min_size=3, max_size=8), pair=st.tuples(*[st.integers(0, 20)] * 2))
 @settings(max_examples=15, deadline=None, suppress_health_check=list(HealthCheck))
 def test_any_history_is_counted_on_and_compared(steps: list[Step], pair: tuple[int, int]) -> None:

@@ -142,7 +142,7 @@ def hide_revision(
     """Writes the rows that revert a revision.
 
     Rows that it added are hidden; rows that it hid or showed are shown or hidden again. Sessions
-    and paths that later revisions use stay visible.
+    and paths to which visible rows belong stay visible, or are shown again.
 
     Args:
         connection: inside a transaction.
@@ -175,6 +175,7 @@ def hide_revision(
         if rows:
             connection.execute(insert(hidden), rows)
         written += len(rows)
+    written += _show_owners(connection, keys, view, revision_key)
     if not written:
         raise RevisionError(f"revision {number} has nothing to revert: none of its rows is visible")
 
@@ -195,6 +196,22 @@ def _used(connection: Connection, view: View, table: Table, found: list[int]) ->
             .order_by(None)
         ).scalars()
     }
+
+
+def _show_owners(connection: Connection, keys: KeyBook, view: View, revision_key: int) -> int:
+    """Shows the hidden paths and sessions to which rows belong that are shown again by now."""
+    written = 0
+    for table in (paths, sessions):
+        query = select(table.c.key).where(table.c.key.in_(view.hidden_keys(table)))
+        concealed = list(connection.execute(query.order_by(table.c.key)).scalars())
+        rows = [
+            hidden_row(keys, revision_key, table, one, hide=False)
+            for one in sorted(_used(connection, view, table, concealed))
+        ]
+        if rows:
+            connection.execute(insert(hidden), rows)
+        written += len(rows)
+    return written
 
 
 def _invert_hidden(
