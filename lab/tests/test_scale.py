@@ -17,10 +17,12 @@ from engram_lab.studies.scale import (
     City,
     Figures,
     ask,
+    download_in,
     drive_in,
     look_back,
     lost_in,
     map_in,
+    merge_in,
     table,
     write_in,
 )
@@ -44,6 +46,8 @@ def test_a_city_is_a_sound_map_that_localises(tmp_path: Path) -> None:
     assert all(seconds >= 0 for seconds in write_in(path, city).values())
     assert {"info (s)", "show NODE (s)", "goal (s)", "plot (s)"} < ask(path, city).keys()
     assert {"diff (s)", "check --since (s)", "revert (s)"} < look_back(path, city).keys()
+    assert {"merge, 50 nodes, beyond the replay (s)"} < merge_in(path, city).keys()
+    assert {"download 5 MB of 2,000 nodes (s)"} < download_in(path, city).keys()
     assert path.read_bytes() == before
 
 
