@@ -362,6 +362,18 @@ class TestCheckNamesTableUuidAndFact:
         assert any(fact.startswith("file: ") for fact in problems(broken))
 
 
+@pytest.mark.parametrize("table", ["nodes", "sessions", "paths", "edges", "cameras"])
+def test_a_page_that_cannot_be_read_is_found_whoever_refers_to_its_rows(broken, table):
+    with contextlib.closing(sqlite3.connect(broken)) as connection:
+        (size,) = connection.execute("PRAGMA page_size").fetchone()
+        query = "SELECT rootpage FROM sqlite_schema WHERE name = ?"
+        (page,) = connection.execute(query, [table]).fetchone()
+    body = bytearray(broken.read_bytes())
+    body[(page - 1) * size : page * size] = bytes(size)
+    broken.write_bytes(body)
+    assert any("malformed" in one and one.startswith(table) for one in problems(broken))
+
+
 class TestCheckSinceARevision:
     def test_only_later_rows_are_read(self, broken, sound):
         whole, later = check_file(broken), check_file(broken, since=1)

@@ -225,19 +225,21 @@ class _Search:
 
     def _add_superseded(self, table: Table, names: Sequence[str]) -> None:
         """Rows that may take the place of those found, or give theirs to them."""
-        same = " AND ".join(f"other.{name} = {table.name}.{name}" for name in names)
+        same = " AND ".join(f"other.{name} = found.{name}" for name in names)
         columns = ", ".join(f"other.{name}" for name in _names(table))
+        # Each of them once, however many rows of a damaged map are equal in these columns.
         statement = (
-            f"SELECT {columns} FROM {table.name} JOIN {table.name} AS other ON {same} "
-            f"AND other.key != {table.name}.key WHERE {table.name}.key BETWEEN ? AND ?"
+            f"SELECT {columns} FROM (SELECT DISTINCT {', '.join(names)} FROM {table.name} "
+            f"WHERE key BETWEEN ? AND ?) AS found CROSS JOIN {table.name} AS other ON {same} "
+            "WHERE other.key NOT BETWEEN ? AND ?"
         )
         for first_and_last in list(stretches(self._found[table])):
-            self._put(table, statement, first_and_last)
+            self._put(table, statement, first_and_last * 2)
 
     def _add(self, table: Table, where: str, values: tuple[int, int]) -> None:
         self._put(table, f"{_select(table)} WHERE {where}", values)
 
-    def _put(self, table: Table, statement: str, values: tuple[int, int]) -> None:
+    def _put(self, table: Table, statement: str, values: tuple[int, ...]) -> None:
         self._found[table].update(
             (row[0], row) for row in _rows(self._connection, statement, values)
         )
@@ -256,7 +258,7 @@ def rows_within(
     return _rows(connection, f"{_select(table)} WHERE {column} BETWEEN ? AND ?", within)
 
 
-def _rows(connection: Connection, statement: str, values: tuple[int, int]) -> list[tuple[Any, ...]]:
+def _rows(connection: Connection, statement: str, values: tuple[int, ...]) -> list[tuple[Any, ...]]:
     # As text, since building a statement takes longer than answering it.
     cursor = connection.exec_driver_sql(statement, values).cursor
     assert cursor is not None

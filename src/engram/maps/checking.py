@@ -281,7 +281,8 @@ class _Checking:
             with self.database.reading() as connection:
                 return list(map(tuple, connection.execute(query)))
         except MapCorruptError:  # reported when the table is read
-            return [row for one in keys for row in self._rows_of(table, [one]) if len(keys) > 1]
+            alone = keys if len(keys) > 1 else []
+            return [row for one in alone for row in self._rows_of(table, [one])]
 
     def _named(self, table: Table, key: int, otherwise: str) -> str:
         """The UUID of a row; other words if there is no sound one."""

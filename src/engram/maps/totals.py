@@ -301,6 +301,8 @@ def with_edges(before: Totals, added: Columns, owners: Owners, sign: int = 1) ->
     steps = np.flatnonzero(_are_steps(added))
     shifts = sign * added["a_from_b"][steps].view("<f8")[:, 9:]
     cameras = owners.of(added["b"][steps])[:, 1]
+    if missing := {*cameras.tolist()} - owners.cameras.keys():
+        raise MapCorruptError(f"table cameras: row {min(missing)}, which others use, is missing")
     forward = {key: np.array(value) for key, value in before.forward.items()}
     mapped_m = before.mapped_m
     # One after the other: sums then do not depend on where one commit ends.
