@@ -230,20 +230,22 @@ class _Checking:
         names = [column.name for column in table.columns]
         for column in _REFERENCES.keys() & set(names):
             self.learn(_REFERENCES[column], [values[names.index(column)] for values in part])
+        sound = []
         for values in part:
             try:
                 (row,) = verified(table, [values])
             except MapCorruptError:
                 self.report(table, self._name(table, values), "does not match its checksum")
                 continue
+            sound.append(values[0])
             self._check_row(table, row, self._name(table, values))
+        if table in self.held:
+            self.held[table].append(np.array(sound, np.int64))
 
     def _check_row(self, table: Table, row: Row, name: str) -> None:
         key = next(iter(row.values()))
         if not 0 <= key <= LARGEST_KEY:
             self.report(table, name, f"its key {key} leaves no room for others")
-        if table in self.held:
-            self.held[table].append(np.array([key]))
         if "revision" in row:
             amount = row["count"] if table is attempts else 1
             self._count(table, row["revision"], np.array([key]), amount)
@@ -339,7 +341,7 @@ class _Checking:
         for key in () if self.thin else np.setdiff1d(held, shown).tolist():
             self.report(nodes, self._named(nodes, key, f"row {key}"), "its frame is missing")
         self._check_history()
-        if len(self.held[map_format]) != 1:
+        if sum(map(len, self.held[map_format])) != 1:
             self.report(map_format, "", "must have one row")
         self._check_tally()
         if not self.problems:
