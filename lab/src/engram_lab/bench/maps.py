@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from engram.frontend.frame import BRIEF
 from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind, Node, PathEntry, PathEntryKind, path_id
-from engram.graph.paths import Attempts
+from engram.graph.neighbourhood import Search
+from engram.graph.paths import Attempts, PathMemory
+from engram.localiser.settings import LocaliserConfig
 from engram.maps.map import Map
 from engram.maps.writer import RevisionWriter
 from engram.places.recognisers import FabMap, FabMapConfig, ObservationModel
@@ -24,6 +26,7 @@ from engram.places.vocabulary import (
 )
 from engram.ranking.context import RankingContext
 from engram.ranking.policies import policy_named
+from engram.robot.localisers import lessons_of
 from engram_lab.bench.data import BenchData
 from engram_lab.bench.stage import PlainPipeline, Prepared
 from engram_lab.bench.synthetic import SyntheticPlace
@@ -43,15 +46,20 @@ _STORED = 20  # of a node: opening reads none of them
 
 
 def prepare_opening(data: BenchData, plain: PlainPipeline | None) -> Prepared:
-    """Open the map and read all that a localiser needs of it: graph, paths and attempts."""
+    """Open the map and read what a localiser needs at one place: graph, paths and lessons."""
     del data, plain
     folder = tempfile.TemporaryDirectory(prefix="engram-bench-")  # lives as long as `ours`
     write_map(Path(folder.name) / "many.engram")
 
     def ours(_: int) -> dict[str, int]:
         with Map.open(Path(folder.name) / "many.engram") as store:
-            graph, attempts = store.graph, store.attempts
-            return {"nodes": len(graph), "edges": len(graph.edges), "attempts": len(attempts.node)}
+            graph, config = store.read_graph(), LocaliserConfig()
+            at, around = SESSION_NODES // 2, Search(config.search_radius_m, np.pi)
+            near = graph.neighbourhood(at, SE3.identity(), _SIGMA, around)
+            _, lessons = lessons_of(store, CAMERA.fx, config.basin, config.lessons)
+            lessons.log_odds_of(near.nodes)
+            PathMemory(graph, pages=store.pages).co_occurrence(near.nodes, near.nodes)
+            return {"nodes": len(graph), "candidates": len(near.nodes)}
 
     return Prepared(ours)
 
