@@ -338,8 +338,11 @@ class _Checking:
     def check_whole(self) -> None:
         """Checks that involve several rows."""
         held, shown = (np.concatenate([_NONE, *self.held[one]]) for one in (nodes, frames))
-        for key in () if self.thin else np.setdiff1d(held, shown).tolist():
-            self.report(nodes, self._named(nodes, key, f"row {key}"), "its frame is missing")
+        for part in () if self.thin else few(np.setdiff1d(held, shown).tolist()):
+            self.known.clear()
+            self.learn(nodes, part)  # at once: a damaged map may lack many
+            for key in part:
+                self.report(nodes, self._named(nodes, key, f"row {key}"), "its frame is missing")
         self._check_history()
         if sum(map(len, self.held[map_format])) != 1:
             self.report(map_format, "", "must have one row")
