@@ -56,7 +56,7 @@ def prepare_opening(data: BenchData, plain: PlainPipeline | None) -> Prepared:
             graph, config = store.read_graph(), LocaliserConfig()
             at, around = SESSION_NODES // 2, Search(config.search_radius_m, np.pi)
             near = graph.neighbourhood(at, SE3.identity(), _SIGMA, around)
-            _, lessons = lessons_of(store, CAMERA.fx, config.basin, config.lessons)
+            lessons = lessons_of(store, CAMERA.fx, config.basin, config.lessons)[1]
             lessons.log_odds_of(near.nodes)
             PathMemory(graph, pages=store.pages).co_occurrence(near.nodes, near.nodes)
             return {"nodes": len(graph), "candidates": len(near.nodes)}
