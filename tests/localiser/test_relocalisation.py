@@ -12,6 +12,7 @@ from tests.builders import World, see
 from engram.errors import IncompatibleError
 from engram.frontend.features import NET
 from engram.frontend.frame import BRIEF, Frame, Landmarks
+from engram.graph.graph import HalfEdges
 from engram.localiser.relocalisation import (
     Exhaustive,
     Relocaliser,
@@ -58,8 +59,8 @@ class _Nodes:
     def node(self, index: int) -> SimpleNamespace:
         return SimpleNamespace(id=index)
 
-    def beside(self, node: int, reach_m: float) -> np.ndarray:
-        return np.zeros(0, np.int32)
+    def half_edges_from(self, nodes: np.ndarray, reach_m: float) -> HalfEdges:
+        return HalfEdges.between(np.zeros((0, 2), np.int32), np.zeros((0, 12)), reach_m)
 
 
 def exhaustive(graph: _Nodes) -> Exhaustive:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import operator
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
@@ -713,15 +712,6 @@ class ExperienceGraph:
     def edge_count(self) -> int:
         """Number of edges: it shows whether `half_edges` would find others than before."""
         return len(self._edges)
-
-    def beside(self, node: int, reach_m: float) -> NDArray[np.int32]:
-        """(K,) int32: nodes joined to a node by an edge of at most `reach_m`."""
-        found: set[int] = set()
-        for half in self._halves(node):
-            b_in_a = self._a_from_b.rows[half // 2, 9:]
-            if math.sqrt(b_in_a @ b_in_a) <= reach_m:
-                found.add(int(self._target.rows[half]))
-        return np.array(sorted(found), np.int32)
 
     def neighbourhood(
         self,

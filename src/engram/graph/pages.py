@@ -147,6 +147,14 @@ class GraphPages(Protocol):
         """Ends (E, 2) and transforms (E, 12) of all edges, as in `GraphPage`."""
         ...
 
+    def edges_at(self, some: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """As `edges`, ends (E, 2) and transforms (E, 12), rotation and metres, of those at nodes.
+
+        Args:
+            some: (S,) dense indices of the nodes.
+        """
+        ...
+
 
 def _refused(name: str) -> Any:
     def asked(_graph: PagedGraph) -> Any:
@@ -313,6 +321,17 @@ class PagedGraph(ExperienceGraph):
         return self._halves_of_map[1].and_those_of(
             HalfEdges.between(ends, self._a_from_b.rows[added], reach_m)
         )
+
+    def half_edges_from(self, nodes: NDArray[np.int64], reach_m: float) -> HalfEdges:
+        """See `ExperienceGraph`: nodes far from each other bring no pages into memory."""
+        pages = nodes // PAGE
+        near = (nodes >= self._end) | np.isin(pages, [*self._loaded, *self._added_at])
+        found = super().half_edges_from(nodes[near], reach_m)
+        if near.all():
+            return found
+        ends, poses = self._pages.edges_at(nodes[~near])
+        more = HalfEdges.between(ends, poses, reach_m)
+        return found.and_those_of(more.rows(np.isin(more.sources, nodes[~near])))
 
     @property
     def edge_count(self) -> int:

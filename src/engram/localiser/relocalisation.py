@@ -121,12 +121,13 @@ class PlaceBelief:
 
     def refute(self, nodes: Sequence[int]) -> None:
         """Counts failed attempts to match the last frame against these nodes, by dense index."""
-        config = self.config
-        for node in nodes:
-            if node < len(self._belief):
-                self._belief[node] -= config.refuted
-                beside = self._graph.beside(node, config.reach_m)
-                self._belief[beside[beside < len(self._belief)]] -= config.refuted_beside
+        config, known = self.config, len(self._belief)
+        held = [node for node in nodes if node < known]
+        steps = self._graph.half_edges_from(np.unique(np.array(held, np.int64)), config.reach_m)
+        for node in held:
+            self._belief[node] -= config.refuted
+            beside = np.unique(steps.targets[steps.sources == node])
+            self._belief[beside[beside < known]] -= config.refuted_beside
 
     def _of_all(self, count: int) -> Array:
         """The belief, extended by new nodes of the graph at its minimum."""

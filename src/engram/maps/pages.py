@@ -42,7 +42,7 @@ from engram.graph.pages import PAGE, GraphPage
 from engram.graph.paths import ENTRY_KINDS, Attempts, Evidence
 from engram.maps.attempts import PAGE as ATTEMPT_PAGE
 from engram.maps.attempts import page_of, unpack, unpack_drive
-from engram.maps.columns import Columns, Visible, read_columns
+from engram.maps.columns import Columns, Visible, read_columns, stretches
 from engram.maps.counting import count_open, totals_of
 from engram.maps.marks import removed_measurements, without_removed
 from engram.maps.reading import load_cameras, sessions_by_key
@@ -127,6 +127,16 @@ class MapPages:
                 found["driven_m"],
                 *self._edges(joined),
             )
+
+    def edges_at(self, some: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """See `GraphPages`."""
+        rows: dict[int, tuple[Any, ...]] = {}
+        with reading_rows(self._database.name):
+            for first, last in stretches(some + 1):
+                found = self._database.rows(_EDGES, {"first": first, "last": last})
+                rows.update((row[0], row) for row in found)
+            ends, _, poses, _ = self._edges(self._seen(edges, list(rows.values())))
+        return ends, poses
 
     def find(self, node: NodeId) -> int | None:
         """See `GraphPages`."""
