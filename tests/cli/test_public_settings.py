@@ -17,7 +17,7 @@ localiser.acceptance: rule min_confidence doubt_after min_inliers min_inliers_lo
 mapper: save_every_m save_every_rad sure_inliers checkpoint_every
 doctor: frames row_offset_px faulty_share
 drive: format rig channel from_ to skip_bad longitude_deg zone calibration field_of_view_deg
-  mask left right motion ranking lanes rounds threads relocaliser
+  mask left right motion ranking lanes rounds threads memory relocaliser
 merge: ranking lanes rounds relocaliser sure_inliers unit segment_share seed
 build: max_gap_m estimator
 download: window_min epoch_min best_percent buffer_min latitude_deg radius_m thumbnails

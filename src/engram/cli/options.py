@@ -201,6 +201,7 @@ class Effort:
             "--memory",
             metavar="SIZE",
             help="Most memory of the map's landmarks and graph: 200MB [default: 300MB].",
+            hidden=True,
         ),
     ] = None
 

@@ -285,6 +285,7 @@ class Map:
         rounds: int = 2,
         relocaliser: str | None = "fabmap",
         threads: int | None = None,
+        memory_bytes: int | None = None,
     ) -> Robot:
         """A robot that localises in this map; see `Robot.step`.
 
@@ -308,6 +309,7 @@ class Map:
             relocaliser: how a lost robot is found: "fabmap", "signature" (net),
                 "exhaustive"; None for none.
             threads: most threads of the robot, the caller's included; None: `lanes` + 2 to 4.
+            memory_bytes: most memory of the map's landmarks and graph; None for about 300 MB.
 
         Raises:
             ConfigError: a keyword or the ranking is unknown, a number is out of range, the name
@@ -322,7 +324,14 @@ class Map:
         from engram.robot.starting import robot_in
 
         self._database.check_open()
-        asked = RobotOptions(ranking, lanes, rounds, relocaliser=relocaliser, threads=threads)
+        asked = RobotOptions(
+            ranking,
+            lanes,
+            rounds,
+            relocaliser=relocaliser,
+            threads=threads,
+            memory_bytes=memory_bytes,
+        )
         setup = RobotSetup(camera, settings or Settings(), asked, name)
         return robot_in(self, setup, maps=maps, remembers=remembers)
 
