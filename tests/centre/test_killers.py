@@ -147,7 +147,13 @@ STRANGE = {
 
 
 @pytest.mark.usefixtures("in_process")
-@pytest.mark.parametrize("kind", STRANGE)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(one, marks=[pytest.mark.long] * (one not in {"newer", "path", "named"}))
+        for one in STRANGE
+    ],
+)
 def test_sessions_of_strange_zones_and_names_harm_nobody(site, kind):
     values, expected = STRANGE[kind]
     agent = site.robot("r1")

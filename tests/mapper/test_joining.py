@@ -63,8 +63,8 @@ def street_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("mapped", "alone_m", "alike_m", "parts"),
     [
         (map_recorded, 120.0, 40.0, 2),  # alike for a while: nothing is joined
-        (map_recorded, 120.0, 86.0, 1),  # the street itself
-        (map_live, 110.0, 30.0, 2),
+        pytest.param(map_recorded, 120.0, 86.0, 1, marks=pytest.mark.long),  # the street itself
+        pytest.param(map_live, 110.0, 30.0, 2, marks=pytest.mark.long),
         (map_live, 60.0, 40.0, 1),  # a third of the way that it was alone
         (map_recorded, 20.0, 40.0, 1),
     ],

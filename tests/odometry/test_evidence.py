@@ -159,7 +159,13 @@ def with_wheels(
     return motions, model
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+_OFTEN = {"none", "slipping", "late"}
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [pytest.param(one, marks=[pytest.mark.long] * (one not in _OFTEN)) for one in FAULTS],
+)
 @settings(max_examples=10)
 @given(st.integers(0, 2**32 - 1))
 def test_sure_images_are_believed_whatever_wheels_measure(fault: str, seed: int) -> None:

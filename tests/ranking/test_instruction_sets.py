@@ -4,6 +4,7 @@ import hashlib
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from tests.instruction_sets import printed
 
 from engram.geometry.se3 import SE3
@@ -37,5 +38,6 @@ def digest() -> str:
     return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
+@pytest.mark.long
 def test_every_instruction_set_gives_the_same_ranking() -> None:
     assert len(printed(PRINT_DIGEST)) == 1

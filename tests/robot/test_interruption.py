@@ -54,7 +54,10 @@ def path_of(town: Path) -> list[tuple[int, str, int]]:
         return [(one.sequence, str(one.node), one.stamp_ns) for one in entries]
 
 
-@pytest.mark.parametrize("stop_after", [1, 5, 9])
+_EARLY, _LATE = (pytest.param(count, marks=pytest.mark.long) for count in (1, 10))
+
+
+@pytest.mark.parametrize("stop_after", [_EARLY, 5, _LATE])
 def test_a_drive_that_saves_nothing_is_resumed_where_it_stopped(
     street: Path, tmp_path: Path, stop_after: int
 ) -> None:
@@ -79,7 +82,7 @@ def test_a_drive_that_saves_nothing_is_resumed_where_it_stopped(
     assert stamps == sorted(set(stamps))  # no frame went into the path twice
 
 
-@pytest.mark.parametrize("stop_after", [1, 6, 11])
+@pytest.mark.parametrize("stop_after", [_EARLY, 6, _LATE])
 def test_a_resumed_first_drive_gives_the_same_map(
     street: Path, tmp_path: Path, stop_after: int
 ) -> None:

@@ -393,8 +393,8 @@ def shifted(drive: list[Seen], first: int, by_s: float, last: int | None = None)
 
 
 @pytest.mark.parametrize("keeps", [{"maps": True}, {"remembers": True}, {}])
-@pytest.mark.parametrize("by_s", [-0.5, -3600.0, 3600.0])
-@pytest.mark.parametrize("at", [1, 30])
+@pytest.mark.parametrize("by_s", [-0.5, pytest.param(-3600.0, marks=pytest.mark.long), 3600.0])
+@pytest.mark.parametrize("at", [pytest.param(1, marks=pytest.mark.long), 30])
 def test_a_clock_that_is_set_costs_two_frames_and_never_the_drive(
     path: Path, keeps: dict[str, bool], by_s: float, at: int
 ) -> None:
@@ -415,7 +415,7 @@ def test_a_clock_that_is_set_costs_two_frames_and_never_the_drive(
 
 
 @pytest.mark.parametrize("by_s", [-3600.0, 0.5, 3600.0])
-@pytest.mark.parametrize("at", [1, 35])
+@pytest.mark.parametrize("at", [pytest.param(1, marks=pytest.mark.long), 35])
 @pytest.mark.parametrize("maps", [True, False])
 def test_one_wrong_stamp_costs_its_own_frame(path: Path, by_s: float, at: int, *, maps) -> None:
     mapped(path)

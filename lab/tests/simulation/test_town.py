@@ -179,7 +179,9 @@ def estate_tile(fronts: Fronts, block: tuple[int, int]) -> _TileBuilder:
     ("fronts", "same_fronts", "same_things"),
     [
         (Fronts(30.0, unique=frozenset({Unique.THINGS, Unique.CARS})), True, False),
-        (Fronts(30.0, unique=frozenset({Unique.CARS})), True, True),
+        pytest.param(
+            Fronts(30.0, unique=frozenset({Unique.CARS})), True, True, marks=pytest.mark.long
+        ),
         (Fronts(30.0, equal=0.0, unique=frozenset()), False, True),
     ],
 )
