@@ -148,7 +148,7 @@ def _writes(method: Callable[Concatenate[Map, _P], _T]) -> Callable[Concatenate[
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Contents:
-    """The records of a map that are read once; the graph and the paths grow with writes."""
+    """The records of a map that are read once."""
 
     graph: ExperienceGraph
     path_memory: PathMemory
@@ -182,8 +182,8 @@ class Map:
     """A map on disk as of one revision. A context manager; threads may share it.
 
     Readers and the writer never wait for each other: readers see the revisions committed when
-    they opened the map. Records stay in memory once read. The graph and the paths are read once,
-    and grow with what this process writes. It is locked for writing while a revision is written.
+    they opened the map. Records stay in memory once read. It is locked for writing while a
+    revision is written.
 
     Attributes:
         frames: the frames of its nodes: a `LandmarkSource`.
@@ -455,12 +455,6 @@ class Map:
         """The places of all nodes in the map frame: all of the map is read for it."""
         with reading_rows(self.location):
             return self.derived(layout_of)
-
-    def grown_graph(self) -> ExperienceGraph | None:
-        """The graph in memory if it has all nodes of the map; None if it would have to be read."""
-        known = self._contents
-        whole = known is not None and len(known.graph) == self.node_count()
-        return known.graph if known is not None and whole else None
 
     @cached_property
     def cameras(self) -> dict[CameraId, StereoCamera]:

@@ -370,10 +370,8 @@ def all_places(store: Map, contents: Mapping[str, float], config: PlacingConfig)
         contents: number of rows that the revision wrote, by table.
         config: how new nodes are laid out.
     """
-    graph = store.grown_graph() if not contents["removals"] else None
-    if graph is None:
-        found = store.load()
-        graph = graph_of(found.nodes, found.edges)
+    found = store.load()
+    graph = graph_of(found.nodes, found.edges)
     own = contents["placements"] or contents["hidden"]
     before = store.read_placements() if own else store.placements
     lay_out = replace_after_removal if contents["removals"] else place
