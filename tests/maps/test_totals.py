@@ -128,7 +128,7 @@ def test_attempts_count_with_those_of_earlier_revisions(location: Path) -> None:
         compare(location, at)
 
 
-def test_attempts_count_anew_where_experiences_join(location: Path) -> None:
+def test_attempts_count_again_where_experiences_join(location: Path) -> None:
     with Map.create(location) as store:
         with begin(store, session("robot-1")) as writer:
             nodes = [node(writer.session, index) for index in range(6)]

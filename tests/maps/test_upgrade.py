@@ -39,8 +39,8 @@ def rows_of(path: Path) -> list[tuple[object, ...]]:
         names = [row[0] for row in connection.execute(
             "SELECT name FROM sqlite_schema WHERE type = 'table' ORDER BY name"
         )]  # fmt: skip
-        anew = {"revisions", "map_format", "runs", "attempts", "hidden", "placements"}
-        kept = [name for name in names if name not in anew]
+        rewritten = {"revisions", "map_format", "runs", "attempts", "hidden", "placements"}
+        kept = [name for name in names if name not in rewritten]
         return [row for name in kept for row in connection.execute(f"SELECT * FROM {name}")]
 
 

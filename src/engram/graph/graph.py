@@ -822,7 +822,7 @@ class ExperienceGraph:
         """Gives back memory; only between two frames."""
 
     def _find(self, node: NodeId) -> int | None:
-        """Dense index of a node; None if there is none."""
+        """Dense index of a node; None if it is not in the graph."""
         return self._index.get(node)
 
     def _want(self, nodes: NDArray[np.int32]) -> None:

@@ -117,7 +117,7 @@ class GraphPages(Protocol):
         ...
 
     def find(self, node: NodeId) -> int | None:
-        """Dense index of a node; None if there is none."""
+        """Dense index of a node; None if it is not in the graph."""
         ...
 
     def session_of(self, index: int) -> SessionId:

@@ -403,7 +403,7 @@ def _right_m(connection: Connection, view: View) -> float | None:
 
 
 def greater_m(known: float | None, values: NDArray[np.float64]) -> float | None:
-    """The largest of a value and others (N,), metres; None if there is none."""
+    """The largest of a value and others (N,), metres; None without any."""
     if not len(values):
         return known
     most = float(values.max())

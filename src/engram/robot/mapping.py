@@ -332,8 +332,9 @@ def map_drive(
             report.resumed = opened.session_state(session.id) is SessionState.INTERRUPTED
         settings = settings.for_descriptor(None if opened is None else opened.descriptor)
         into = _written(map_path) if opened is None else nullcontext(opened)
-        setup = RobotSetup(sequence.camera, settings, options, session.robot, session)
-        setup = replace(setup, fix=fixes_of(sequence))
+        setup = RobotSetup(
+            sequence.camera, settings, options, session.robot, session, fixes_of(sequence)
+        )
         front = Front(settings)
         front.examination.evidence.facts = facts_of(sequence)
         try:
