@@ -14,7 +14,7 @@ from engram.errors import MapCorruptError
 from engram.frontend.frame import BRIEF
 from engram.geometry.se3 import SE3
 from engram.graph import paths as path_memories
-from engram.graph.basin import MatchBasin
+from engram.graph.basin import MatchBasin, count_attempts
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
     Edge,
@@ -217,9 +217,18 @@ def test_hidden_nodes_are_not_there(town: Path) -> None:
 def test_lessons_basin_and_paths_are_the_same(opened: Map) -> None:
     paged, whole, config = opened.read_graph(), opened.graph, LocaliserConfig()
     basin, lessons = lessons_of(opened, CAMERA.fx, config.basin, config.lessons)
-    counted = MatchBasin.of(CAMERA.fx, opened.totals().basin_counts, config.basin)
-    np.testing.assert_array_equal(basin.rates, counted.rates)
     made, viewers = opened.attempts, [path_id(one) for one in opened.sessions]
+    counts = count_attempts(
+        made.session.astype(np.int64),
+        whole.experiences[made.node].astype(np.int64),
+        made.iteration,
+        (made.along_m.astype(np.float64), made.across_m.astype(np.float64)),
+        made.sigma_m.astype(np.float64),
+        made.accepted,
+    )
+    assert counts.attempts.sum() > 0
+    counted = MatchBasin.of(CAMERA.fx, counts, config.basin)
+    np.testing.assert_array_equal(basin.rates, counted.rates)
     rates = counted.success_rate(made.along_m.astype(np.float64), made.across_m.astype(np.float64))
     learnt = Lessons.learnt(whole, opened.path_memory, viewers, made, rates, config.lessons)
     numbers = np.arange(len(whole), dtype=np.int32)
