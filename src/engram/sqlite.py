@@ -80,6 +80,7 @@ class FileKind:
         cure: advice for a damaged file.
         busy_s: how long to wait for another process to release the file, seconds.
         older: advice for a file of an earlier format.
+        newest: tables without which a file is of a draft of the format, and advice for it.
     """
 
     noun: str
@@ -90,6 +91,7 @@ class FileKind:
     cure: str
     busy_s: float
     older: str = ""
+    newest: tuple[frozenset[str], str] = (frozenset(), "")
 
 
 class SqliteFile:
@@ -176,6 +178,12 @@ class SqliteFile:
         found = execute("SELECT type, name FROM sqlite_schema WHERE type != 'index'").fetchall()
         present = {(str(kind), str(name)) for kind, name in found}
         wanted = {("table", name) for name in self.kind.metadata.tables}
+        newest, advice = self.kind.newest
+        if newest and wanted - present == {("table", name) for name in newest}:
+            raise FormatVersionError(
+                f"{self.path} is a {self.kind.noun} of a draft of format "
+                f"{self.kind.format_version}: {advice}"
+            )
         if present != wanted:
             raise MapCorruptError(
                 f"{self.path}: not the tables of its format: missing {sorted(wanted - present)}, "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.maps.records import SessionState
 from engram.maps.schema import FORMAT_VERSION
+from engram.maps.upgrading import upgrade_map
 from engram_lab.teblid import TEBLID
 
 from .data.make_map import OMITTED, write_map
@@ -27,12 +29,12 @@ STORED = Path(__file__).parent / "data" / f"format-{FORMAT_VERSION}.engram"
 PAGE = Path(__file__).parents[2] / "docs" / "format.md"
 # Of its revisions: two drives, the second taken back, mapped again, amended, and the marks.
 HASHES = {
-    1: "d44268f42b8e5241a9424a74013175ae",
-    2: "8c0715f98ef7aa9bf2eeca8c71fc8548",
-    3: "ce3b14e8603ef5c4d823f694c25c26e5",
-    4: "53306e83d12da367da9e50cb263d9d2c",
-    5: "d0bc2349e34d76d39369924f60413f47",
-    6: "154d879dbb0f85c2a639533af7631d06",
+    1: "0355106e0b85ebde08518eb88d6e9cfd",
+    2: "9a4e2b5809647ec0b413e91daf1b7498",
+    3: "cabb0d7d3f6c74cd13656c96b60c81ba",
+    4: "1100c63d88c24894a9f004f0165ccfe6",
+    5: "63e117293805e983abbd7be169b41de4",
+    6: "764205d7c8dbd8053274528104e229f2",
 }
 
 
@@ -146,6 +148,14 @@ def test_other_formats_are_refused_with_advice(stored: Path, version: int, advic
     connection.close()
     for opener in (Map.open, partial(Map.open, writes=True), check_file):
         with pytest.raises(FormatVersionError, match=rf"map of format {version}, .*{advice}"):
+            opener(stored)
+
+
+def test_drafts_of_the_format_are_refused_with_advice(stored: Path) -> None:
+    with closing(sqlite3.connect(stored)) as connection:
+        connection.executescript("DROP TABLE forgotten; DROP TABLE receipts")
+    for opener in (Map.open, check_file, upgrade_map):
+        with pytest.raises(FormatVersionError, match=r"draft of format 7.*map the drives again"):
             opener(stored)
 
 

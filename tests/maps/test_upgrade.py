@@ -48,7 +48,7 @@ def test_it_holds_the_same_and_answers_the_same(old: Path) -> None:
     before = rows_of(old)
     done = upgrade_map(old)
     assert (done.before, done.after, done.revisions) == (6, 7, 6)
-    assert done.after_bytes <= 1.33 * done.before_bytes  # each new index takes a page of it
+    assert done.after_bytes <= 1.4 * done.before_bytes  # each new table or index takes a page
     assert rows_of(old) == before
     assert check_file(old).problems == ()
     for at in range(1, 5):  # later ones hold the time at which they were made

@@ -56,6 +56,7 @@ from engram.maps.schema import (
     attempts,
     cameras,
     edges,
+    forgotten,
     frames,
     frontends,
     goals,
@@ -69,6 +70,7 @@ from engram.maps.schema import (
     paths,
     place_blocks,
     placements,
+    receipts,
     removals,
     revisions,
     runs,
@@ -99,6 +101,7 @@ _ORDER = (
     cameras,
     frontends,
     *VERSIONED,
+    receipts,
     tags,
     tag_tally,
     words,
@@ -193,13 +196,20 @@ class _Checking:
 
     def _queries(self, table: Table) -> Iterator[Select[Any]]:
         """The rows that are to be checked."""
-        if self.since is None or table not in VERSIONED:
+        if self.since is None or table not in {*VERSIONED, receipts}:
             yield select(table)
             return
-        for row in self.revision_rows.values():
-            if row["number"] is None or row["number"] > self.since:
-                with suppress(MapCorruptError):  # reported with the history
-                    yield select(table).where(own_rows(row).rows(table))
+        later = [
+            row
+            for row in self.revision_rows.values()
+            if row["number"] is None or row["number"] > self.since
+        ]
+        if table is receipts:
+            yield select(table).where(receipts.c.revision.in_([row["key"] for row in later]))
+            return
+        for row in later:
+            with suppress(MapCorruptError):  # reported with the history
+                yield select(table).where(own_rows(row).rows(table))
 
     def _are_sound(self, table: Table, part: list[tuple[Any, ...]]) -> bool:
         """Whether all these rows and their references are sound, without saying which is not."""
@@ -261,10 +271,19 @@ class _Checking:
         self.brought[revision, table.name] += amount
         self.stored[revision] += len(keys)
         first, last = int(keys[0]), int(keys[-1])
-        self.ranges[revision, table.name] = (
-            self.ranges.get((revision, table.name), (first, last))[0],
-            last,
-        )
+        known = self.ranges.get((revision, table.name), (first, last))
+        self.ranges[revision, table.name] = (min(known[0], first), max(known[1], last))
+
+    def count_erased(self, table: Table, receipt: Row) -> None:
+        """Counts a row that is no longer there among those of its revision."""
+        key = np.array([receipt["target"]])
+        self._count(table, receipt["revision"], key, receipt["count"])
+
+    def is_erased(self, table: Table, key: int) -> bool:
+        """Whether a receipt says that there was such a row."""
+        of_table = (receipts.c.record == table.name) & (receipts.c.target == key)
+        with self.database.reading() as connection:
+            return connection.execute(select(receipts.c.key).where(of_table)).first() is not None
 
     def learn(self, table: Table, keys: Iterable[Any]) -> None:
         """Looks up rows, for as long as the same part is checked; unsound ones count as missing."""
@@ -521,7 +540,7 @@ def _check_attempts(checking: _Checking, row: Row) -> None:
         checking.learn(nodes, keys)
         for key in keys:
             fact = checking.reference_problem(revision, nodes, key)
-            if fact:
+            if fact and not checking.is_erased(nodes, key):
                 raise MapCorruptError(f"a {name} {fact}")
 
 
@@ -559,8 +578,27 @@ def _check_hidden(checking: _Checking, row: Row) -> None:
     table = metadata.tables.get(row["record"])
     if table in _HIDEABLE:
         checking.learn(table, [row["target"]])
-    if table not in _HIDEABLE or row["target"] not in checking.known[table]:
+    if table not in _HIDEABLE or not (
+        row["target"] in checking.known[table] or checking.is_erased(table, row["target"])
+    ):
         raise MapCorruptError(f"hides row {row['target']} of {row['record']}, which is missing")
+
+
+def _check_forgotten(_: _Checking, row: Row) -> None:
+    uuid_from_bytes(row["uuid"], "the row")
+    if row["record"] not in {sessions.name, nodes.name}:
+        raise MapCorruptError(f"names a row of {row['record']!r:.40}")
+
+
+def _check_receipt(checking: _Checking, row: Row) -> None:
+    table = metadata.tables.get(row["record"])
+    if table not in _HIDEABLE or row["count"] < 1 or len(row["digest"] or bytes(16)) != 16:
+        raise MapCorruptError(f"row {row['target']} of {row['record']!r:.40} cannot have been")
+    if {row["revision"], row["forgotten"]} - checking.revision_rows.keys():
+        raise MapCorruptError("its revision, or the one that forgot its row, is missing")
+    if row["uuid"] is not None:
+        uuid_from_bytes(row["uuid"], "the row")
+    checking.count_erased(table, row)
 
 
 def _check_tag(checking: _Checking, row: Row) -> None:
@@ -651,7 +689,9 @@ _ROW_CHECKS: dict[Table, Callable[[_Checking, Row], None]] = {
     removals: _check_removal,
     placements: _check_placement,
     goals: _check_goal,
+    forgotten: _check_forgotten,
     hidden: _check_hidden,
+    receipts: _check_receipt,
     tags: _check_tag,
     words: _check_words,
     place_blocks: _check_place_block,

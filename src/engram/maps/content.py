@@ -1,7 +1,7 @@
 """The content hash: equal for equal maps, independent of place and time (method §7.5).
 
 That of a revision is made of the one before and of what the revision adds, so that a commit hashes
-its own rows alone.
+its own rows alone. A row counts by its digest, which a receipt keeps when the row is erased.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import msgspec
@@ -31,6 +31,7 @@ from engram.maps.schema import (
     nodes,
     paths,
     placements,
+    receipts,
     revisions,
     sessions,
 )
@@ -53,8 +54,10 @@ _REFERENCES = {
 # Landmarks count by their hashes. Thumbnails are left out, since decoders differ, and placements,
 # since they follow from the rest to the rounding of a linear solver.
 _HASHED = tuple(table for table in VERSIONED if table not in {frames, placements})
+_HIDDEN = {*VERSIONED} - {hidden, placements}
 _LEFT_OUT = {"key", "checksum"}
 _NAMED_BY_UUID = (sessions, nodes, paths)
+_ANY_RECEIPT = "SELECT EXISTS (SELECT 1 FROM receipts)"
 # UUIDs of a table that are kept from one revision to the next.
 _MOST = 100_000
 _HISTORY = ("number", "parent", "author", "message", "tool_version", "configuration")
@@ -119,9 +122,9 @@ def chained(
     digest.update(_encode([row[name] for name in _HISTORY]))
     for table in _HASHED:
         if table.name in own.ranges:
-            rows = _canonical_rows(connection, table, own.rows(table), known)
-            for part in _parts(table.name, sorted(set(rows.values()))):
-                digest.update(part)
+            rows = _digests(connection, table, own.rows(table), known)
+            erased = _erased(connection, own.erased(table)) if known.have_gone else {}
+            digest.update(_table_bytes(table, {*rows.values(), *erased.values()}))
     return digest.hexdigest()[:32]
 
 
@@ -141,25 +144,53 @@ def record_hashes(connection: Connection, at: int) -> dict[str, str]:
     found = {}
     known, seen = Identities(connection), View(at).revision_keys()
     for table in _HASHED:
-        rows = _canonical_rows(connection, table, table.c.revision.in_(seen), known)
+        of_table = (receipts.c.record == table.name) & receipts.c.revision.in_(seen)
+        rows = {
+            *_digests(connection, table, table.c.revision.in_(seen), known).values(),
+            *_erased(connection, of_table).values(),
+        }
         if rows:
-            digest = hashlib.sha256()
-            for part in _parts(table.name, sorted(set(rows.values()))):
-                digest.update(part)
+            digest = hashlib.sha256(_table_bytes(table, rows))
             found[str(table.name)] = digest.hexdigest()[:16]
     return found
 
 
-def _parts(name: str, rows: list[bytes]) -> Iterator[bytes]:
-    yield _encode([str(name), len(rows)])
-    yield from rows
+def _table_bytes(table: Table, digests: set[bytes]) -> bytes:
+    """What rows of a table add to a hash, given by their digests."""
+    return _encode([str(table.name), len(digests)]) + b"".join(sorted(digests))
+
+
+def row_digests(
+    connection: Connection, table: Table, keys: Collection[int], known: Identities
+) -> dict[int, bytes | None]:
+    """What stands for rows in the content hash, by key; None for a table that is not in it.
+
+    Raises:
+        MapCorruptError: a row is damaged or points at nothing.
+    """
+    if table not in _HASHED:
+        return dict.fromkeys(keys)
+    found = _target_digests(connection, table, keys, known)
+    return {key: found[key] for key in keys}
+
+
+def _erased(connection: Connection, which: ColumnElement[bool]) -> dict[int, bytes]:
+    """Digests of erased rows by the keys that they had, of receipts."""
+    query = select(receipts).where(which).order_by(receipts.c.key)
+    found = verified(receipts, connection.execute(query))
+    return {row["target"]: row["digest"] for row in found if row["digest"] is not None}
 
 
 class Identities:
-    """What names a row in all equal maps, by table and key; read when first needed."""
+    """What names a row in all equal maps, by table and key; read when first needed.
+
+    Attributes:
+        have_gone: whether the map has erased rows.
+    """
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
+        self.have_gone = bool(connection.exec_driver_sql(_ANY_RECEIPT).scalar())
         numbers = select(revisions.c.key, revisions.c.number).where(revisions.c.number.is_not(None))
         self._known: dict[str, dict[int, Any]] = {
             "revisions": {row[0]: row[1] for row in connection.execute(numbers)},
@@ -199,22 +230,26 @@ class Identities:
         for part in few(wanted) if "uuid" in uuids.c else ():
             query = select(uuids.c.key, uuids.c.uuid).where(uuids.c.key.in_(part))
             known.update(map(tuple, self._connection.execute(query)))
+            if erased := [key for key in part if key not in known]:
+                of_table = (receipts.c.record == table) & receipts.c.target.in_(erased)
+                query = select(receipts.c.target, receipts.c.uuid).where(of_table)
+                known.update(map(tuple, self._connection.execute(query)))
         missing = [key for key in wanted if key not in known]
         if missing:
             raise MapCorruptError(f"table {table}: row {missing[0]}, which others use, is missing")
         return known
 
 
-def _canonical_rows(
+def _digests(
     connection: Connection, table: Table, which: ColumnElement[bool], known: Identities
 ) -> dict[int, bytes]:
-    """One byte string per row, by key; the same for all attempts of a revision and session."""
+    """16 bytes for each row, by key; the same for all attempts of a revision and session."""
     query = select(table).where(which).order_by(*table.primary_key.columns)
     found = connection.execute(query)
     if table is attempts:
-        return _canonical_attempts(list(verified(table, found)), known)
+        return _attempt_digests(list(verified(table, found)), known)
     if table is hidden:
-        return _canonical_hidden(connection, list(verified(table, found)), known)
+        return _hidden_digests(connection, list(verified(table, found)), known)
     rows = list(verified_values(table, found))
     known.learn(table, rows)
     names = [column.name for column in table.columns]
@@ -226,24 +261,28 @@ def _canonical_rows(
     ]
     key = names.index("key")
     return {
-        row[key]: _encode([row[at] if named is None else named[row[at]] for at, named in columns])
+        row[key]: _digest([row[at] if named is None else named[row[at]] for at, named in columns])
         for row in rows
     }
+
+
+def _digest(canonical: list[Any]) -> bytes:
+    return hashlib.sha256(_encode(canonical)).digest()[:16]
 
 
 def _at(rows: list[Any], at: int) -> set[int]:
     return {row[at] for row in rows}
 
 
-def _canonical_attempts(rows: list[Row], known: Identities) -> dict[int, bytes]:
-    """Attempts, independent of their packing."""
+def _attempt_digests(rows: list[Row], known: Identities) -> dict[int, bytes]:
+    """Of attempts, independent of their packing."""
     packed: dict[tuple[int, int], list[Row]] = {}
     for row in rows:
         packed.setdefault((row["revision"], row["session"]), []).append(row)
     found: dict[int, bytes] = {}
     for (revision, session), bodies in packed.items():
         table = unpack_drive(bodies)
-        content = _encode(
+        content = _digest(
             [
                 known.of("revisions", [revision])[revision],
                 known.of("sessions", [session])[session],
@@ -266,43 +305,49 @@ def _column_bytes(table: Attempts, name: str, known: Identities) -> bytes:
     return values.astype(values.dtype.newbyteorder("<")).tobytes()
 
 
-def _canonical_hidden(
-    connection: Connection, rows: list[Row], known: Identities
-) -> dict[int, bytes]:
-    """Rows that hide others, each with the row that it hides."""
+def _hidden_digests(connection: Connection, rows: list[Row], known: Identities) -> dict[int, bytes]:
+    """Of rows that hide others, each with the row that it hides."""
     targets: dict[str, set[int]] = defaultdict(set)
     for row in rows:
         if row["record"] != placements.name:
             targets[row["record"]].add(row["target"])
-    canonical = {
-        name: _canonical_targets(connection, metadata.tables[name], sorted(keys), known)
+    named = {
+        name: _target_digests(connection, metadata.tables[name], keys, known)
         for name, keys in targets.items()
-        if metadata.tables.get(name) in _HASHED and name != hidden.name
+        if metadata.tables.get(name) in _HIDDEN
     }
     found = {}
     for row in rows:
         if row["record"] == placements.name:
             continue
-        target = canonical.get(row["record"], {}).get(row["target"])
+        target = named.get(row["record"], {}).get(row["target"])
         if target is None:
             raise MapCorruptError(f"table hidden: row {row['key']} hides a row that is missing")
         number = known.of("revisions", [row["revision"]])[row["revision"]]
-        found[row["key"]] = _encode([number, row["record"], target, row["hidden"]])
+        found[row["key"]] = _digest([number, row["record"], target, row["hidden"]])
     return found
 
 
-def _canonical_targets(
-    connection: Connection, table: Table, keys: list[int], known: Identities
+def _target_digests(
+    connection: Connection, table: Table, keys: Collection[int], known: Identities
 ) -> dict[int, bytes]:
-    """The rows of these keys; of attempts, with all others of their revision and session."""
+    """Of the rows of these keys; of attempts, with all others of their revision and session.
+
+    A picture, which is hidden as a row of `frames`, goes by the UUID of its node.
+    """
+    if table is frames:
+        return known.of(nodes.name, keys)
     found: dict[int, bytes] = {}
-    for part in few(keys):
+    for part in few(sorted(keys)):
         which = table.c.key.in_(part)
         if table is attempts:
             pairs = select(attempts.c.session, attempts.c.revision).where(which).distinct()
             for session, revision in connection.execute(pairs).fetchall():
                 both = (attempts.c.session == session) & (attempts.c.revision == revision)
-                found |= _canonical_rows(connection, table, both, known)
+                found |= _digests(connection, table, both, known)
         else:
-            found |= _canonical_rows(connection, table, which, known)
+            found |= _digests(connection, table, which, known)
+        if erased := [key for key in part if key not in found]:
+            of_table = (receipts.c.record == table.name) & receipts.c.target.in_(erased)
+            found |= _erased(connection, of_table)
     return found

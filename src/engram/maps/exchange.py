@@ -21,6 +21,7 @@ from engram.maps.schema import (
     frontends,
     metadata,
     nodes,
+    receipts,
     revisions,
     tags,
     words,
@@ -30,7 +31,9 @@ from engram.maps.totals import runs_of
 from engram.maps.view import View, head
 
 # In the order in which rows refer to each other.
-EXCHANGED: tuple[Table, ...] = (revisions, cameras, frontends, *VERSIONED, tags, words)
+EXCHANGED: tuple[Table, ...] = (
+    revisions, cameras, frontends, *VERSIONED, receipts, tags, words,
+)  # fmt: skip
 # All tables but those of the format, of the tally, of the runs and of the blocks of places.
 assert len(EXCHANGED) == len(metadata.tables) - 4
 
@@ -79,7 +82,7 @@ class MapRows:
         query = select(table).order_by(*table.primary_key.columns)
         if table is revisions:
             return query.where(revisions.c.key.in_(seen))
-        if table in VERSIONED:
+        if table in VERSIONED or table is receipts:
             return query.where(table.c.revision.in_(seen))
         if table is words:
             saved = select(nodes.c.key).where(nodes.c.revision.in_(seen))

@@ -29,6 +29,7 @@ _TOLD = {
     "placements": ("node", " placed"),
     "anchors": ("anchor", ""),
     "goals": ("goal", ""),
+    "forgotten": ("id", " forgotten"),
     "hidden": ("row", " hidden or shown again"),
 }
 

@@ -19,6 +19,7 @@ from engram.maps.schema import (
     attempts,
     cameras,
     edges,
+    forgotten,
     frames,
     frontends,
     goals,
@@ -60,6 +61,7 @@ _TABLES = (
     placements,
     anchors,
     goals,
+    forgotten,
     hidden,
 )
 

@@ -249,6 +249,32 @@ hidden = _table(
     Index("hidden_by_target", "record", "target"),
 )
 
+# What may not be taken in again. Rows of the same revision hide what the map had of it.
+forgotten = _table(
+    "forgotten",
+    _key(),
+    _int("revision"),
+    _text("record", "`sessions`, `nodes`"),
+    _uuid(),
+    UniqueConstraint("uuid", "revision"),
+)
+
+# What is left of rows that were erased: history is verified by their digests. They belong to no
+# revision, since they change nothing that is visible.
+receipts = _table(
+    "receipts",
+    _key(),
+    _text("record", "table"),
+    _int("target", "key that the row had"),
+    _int("revision", "its revision"),
+    _bytes("uuid", "its UUID, if it had one", nullable=True, size=16),
+    _int("count", "1; of a row of attempts, theirs"),
+    _bytes("digest", "16 bytes, below; NULL if not in the content hash", nullable=True, size=16),
+    _int("forgotten", "revision that forgot it, whose message says why"),
+    _int("erased_ns"),
+    UniqueConstraint("record", "target"),
+)
+
 # Names of revisions. They belong to no revision: setting, moving or removing a tag changes neither
 # history nor content hash. Of the rows of one name the newest counts.
 tags = _table(
@@ -378,6 +404,7 @@ VERSIONED: tuple[Table, ...] = (
     placements,
     anchors,
     goals,
+    forgotten,
     hidden,
 )
 KEYED: tuple[Table, ...] = tuple(table for table in metadata.sorted_tables if "key" in table.c)

@@ -101,6 +101,10 @@ MAP_FILE = FileKind(
     strange=NotAMapError,
     cure="run engram check, and restore a copy",
     older="engram upgrade converts maps of format 6; map the drives of older ones again",
+    newest=(
+        frozenset({"forgotten", "receipts"}),
+        "drafts of the format are not read any more; map the drives again",
+    ),
     busy_s=30.0,  # seconds; writers lock the file only for a checkpoint
 )
 # SQLite then takes no locks, and does not notice writes of other processes.

@@ -32,6 +32,7 @@ from engram.maps.schema import (
     path_entries,
     paths,
     placements,
+    receipts,
     removals,
     revisions,
     sessions,
@@ -142,6 +143,12 @@ class Own:
         first, last = self.ranges.get(table.name, (0, -1))
         key = table.primary_key.columns[0]
         return key.between(first, last) & (table.c.revision == self.key)
+
+    def erased(self, table: Table) -> ColumnElement[bool]:
+        """The condition that a receipt is of one of them."""
+        first, last = self.ranges.get(table.name, (0, -1))
+        of_table = (receipts.c.record == table.name) & receipts.c.target.between(first, last)
+        return of_table & (receipts.c.revision == self.key)
 
 
 def own_rows(row: Row) -> Own:

@@ -39,11 +39,13 @@ from engram.maps.schema import (
     FORMAT_VERSION,
     VERSIONED,
     attempts,
+    forgotten,
     hidden,
     map_format,
     metadata,
     place_blocks,
     placements,
+    receipts,
     revisions,
     runs,
 )
@@ -57,7 +59,7 @@ _NEW_COLUMNS = {
     attempts: ("page",),
     placements: ("cell",),
 }
-_NEW_TABLES = (runs, place_blocks)
+_NEW_TABLES = (runs, place_blocks, forgotten, receipts)
 # Tables whose rows are written again, and what they are called meanwhile.
 _REWRITTEN = {table: f"{table.name}_6" for table in (revisions, attempts, hidden, placements)}
 # How long to wait for a process that is just closing the map.

@@ -139,7 +139,12 @@ def head(connection: Connection) -> int:
 
 # Of 64 bits, with room left: no writer comes near it.
 LARGEST_KEY = 2**62
-_NEWEST_KEYS = "SELECT " + ", ".join(f"(SELECT max(key) FROM {one.name})" for one in KEYED)
+# Keys of erased rows are not given again: other rows still name them.
+_NEWEST_KEYS = "SELECT " + ", ".join(
+    f"(SELECT max(key) FROM (SELECT max(key) AS key FROM {one.name} UNION ALL "
+    f"SELECT max(target) FROM receipts WHERE record = '{one.name}'))"
+    for one in KEYED
+)
 _NODE_OF_UUID = (
     select(nodes.c.key, nodes.c.revision)
     .where(nodes.c.uuid == bindparam("uuid"))
