@@ -303,7 +303,7 @@ inline Floats ambient(const Frame &frame, const Point &point) {
   const Floats height = larger(point.at.z, Floats{});
   const Floats open = 1 - (1 - ground) * exp_of(-0.22f * height);
   const Floats from_sky = light.sky_power * open * (0.92f + 0.08f * point.normal.z);
-  const Floats bounced = (0.12f * light.sky_power + 0.10f * light.sun_power) * (0.4f + 0.6f * open);
+  const Floats bounced = (0.12f * light.sky_power + 0.04f * light.sun_power) * (0.4f + 0.6f * open);
   return from_sky + bounced;
 }
 

@@ -60,7 +60,7 @@ def test_what_a_drive_met_stands_beside_its_truth(tmp_path: Path) -> None:
     rain = replace(campaign_named("hamlet", 2), spacing_m=30.0)
     report = simulate(rain, tmp_path, sessions=[4])
     target = Path(report.files[0])
-    assert target.parent.name == "hamlet-standard-seed2-v6"
+    assert target.parent.name == "hamlet-standard-seed2-v7"
     rows = np.loadtxt(met_path(target), delimiter=",", skiprows=1)
     assert rows.shape == (report.frames, 5)
     rate, cover, sun_deg, exposure = rows[:, 0], rows[:, 1:3], rows[:, 3], rows[:, 4]

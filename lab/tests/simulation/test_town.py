@@ -144,7 +144,7 @@ def test_unknown_weather_is_refused() -> None:
 
 
 def test_what_was_changed_for_good_stays_changed() -> None:
-    before, after = alterations_on(1, 30), alterations_on(1, 60)
+    before, after = alterations_on(1, 120), alterations_on(1, 240)
     lasting = {a for a in before if a.kind is not AlterationKind.SCAFFOLD}
     assert lasting <= after
     assert len(after) > len(before)

@@ -1,6 +1,6 @@
 """Protocol H: how many inliers are left of a day's map as the hours pass, in clear weather.
 
-    python -m engram_lab.roads.hours [--towns 501,502,503] [--rows roads.csv]
+    python -m engram_lab.roads.hours [--towns 504,505,506] [--rows roads.csv]
 
 The road: 512×384 pictures of a robot at the University of Toronto (3 and 9 August), matched by
 features learnt on that very place (utiasASRL, deep_learned_visual_features). Its hours are met by

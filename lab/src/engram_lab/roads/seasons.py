@@ -1,9 +1,10 @@
 """Protocol R: a map of an overcast day against every other condition, as RobotCar Seasons does it.
 
-    python -m engram_lab.roads.seasons [--towns 501,502,503] [--only rain,night] [--rows roads.csv]
+    python -m engram_lab.roads.seasons [--towns 504,505,506] [--only rain,night] [--rows roads.csv]
 
 OpenCV's SIFT, one picture at a time. What counts is the share within 5 m and 10° and its difference
-to another overcast day. Towns 501 to 503 are for judging: nothing is ever tuned on them.
+to another overcast day. Towns 504 to 506 are for judging: nothing is ever tuned on them.
+501 to 503 judged an earlier choice of light and works.
 
 The road's differences are those of SIFT, ratio test and NetVLAD retrieval on RobotCar Seasons'
 training split, by condition.
@@ -24,7 +25,7 @@ from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.roads.matching import SIFT, Answer, Answers, Mapped
 from engram_lab.town.rendering import Places, Visit, at
 
-JUDGED = (501, 502, 503)
+JUDGED = (504, 505, 506)
 # A loop long enough for a hundred places that share little of what they see.
 _LOOP_M, EVERY_M = 750.0, 7.5
 

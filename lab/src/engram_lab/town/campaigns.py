@@ -25,7 +25,7 @@ from engram_lab.town.streets import (
 )
 
 # Raised whenever a frame of any campaign changes: rendered data is kept by it.
-WORLD_VERSION = 6
+WORLD_VERSION = 7
 
 
 _SUMMER_TIME = timedelta(hours=1)

@@ -20,7 +20,7 @@ AUREOLE = 0.1  # share of the sun's light that comes from around it and fills sh
 MIRRORS = 0.5  # of what wet tarmac throws back; the rest is scattered by its grain
 # At night, with what lit walls and windows throw on each other, which is not traced; and by how
 # much more clouds throw back (3 to 10 times overcast: Kyba et al. 2011).
-_TOWN_GLOW, _GLOW_OF_CLOUDS = 0.0005, 2.0
+_TOWN_GLOW, _GLOW_OF_CLOUDS = 0.0003, 2.0
 
 _J2000 = datetime(2000, 1, 1, 12, tzinfo=UTC)
 

@@ -272,9 +272,6 @@ def _outline(cells: set[Junction]) -> tuple[Junction, ...]:
     return tuple(walk)
 
 
-_MEAN_DAYS_BETWEEN = 4.0  # per kind, town-wide
-
-
 class AlterationKind(Enum):
     """What happens."""
 
@@ -282,6 +279,17 @@ class AlterationKind(Enum):
     SCAFFOLD = 1  # stands for weeks
     FELLED = 2  # trees are felled, permanently
     NEW_SIGN = 3  # permanently
+
+
+# Mean days from one alteration to the next, town-wide. One meets one thing in forty: in a year a
+# third of the fronts is repainted and a tenth of the trees felled; scaffolds hide one front in
+# twenty at any time.
+_DAYS_BETWEEN = {
+    AlterationKind.REPAINT: 20.0,
+    AlterationKind.SCAFFOLD: 15.0,
+    AlterationKind.FELLED: 80.0,
+    AlterationKind.NEW_SIGN: 20.0,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +312,7 @@ def alterations_on(seed: int, day: int) -> frozenset[Alteration]:
     for kind in AlterationKind:
         rng = np.random.default_rng([seed, 0xA17, kind.value])
         start, number = 0.0, 0
-        while (start := start + rng.exponential(_MEAN_DAYS_BETWEEN)) <= day:
+        while (start := start + rng.exponential(_DAYS_BETWEEN[kind])) <= day:
             lasts = rng.uniform(14, 45) if kind is AlterationKind.SCAFFOLD else np.inf
             if day < start + lasts:
                 found.add(Alteration(kind, number, seed))
