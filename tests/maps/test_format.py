@@ -27,14 +27,17 @@ from .maps import begin, node, session
 
 STORED = Path(__file__).parent / "data" / f"format-{FORMAT_VERSION}.engram"
 PAGE = Path(__file__).parents[2] / "docs" / "format.md"
-# Of its revisions: two drives, the second taken back, mapped again, amended, and the marks.
+# Of its revisions: two drives, the second taken back, mapped again, amended, the marks, and a drive
+# that was forgotten.
 HASHES = {
     1: "0355106e0b85ebde08518eb88d6e9cfd",
     2: "9a4e2b5809647ec0b413e91daf1b7498",
     3: "cabb0d7d3f6c74cd13656c96b60c81ba",
     4: "1100c63d88c24894a9f004f0165ccfe6",
-    5: "63e117293805e983abbd7be169b41de4",
-    6: "764205d7c8dbd8053274528104e229f2",
+    5: "6fbc5b5fe86a1f42937a00e9f99ed7ed",
+    6: "3be46ddd2a07cde630627219d2381b8c",
+    7: "b121d98358e40db93b970bfc8ffa4dac",
+    8: "36aa00da23eac6d8a3427c2a0f222172",
 }
 
 
@@ -104,6 +107,20 @@ def test_marks_and_omissions_read_as_written(stored: Path) -> None:
         assert omission.omitted == OMITTED
         assert omission.node == node(session("robot-1"), 1).id
         assert store.landmark_hashes[OMITTED] == omission.landmark_hash == bytes(range(16))
+
+
+def test_what_was_erased_has_left_its_receipts(stored: Path) -> None:
+    gone = session("robot-5").id
+    with closing(sqlite3.connect(stored)) as connection:
+        found = connection.execute("SELECT record, count(*) FROM receipts GROUP BY record")
+        assert dict(found) == {
+            "sessions": 1, "nodes": 2, "frames": 2, "edges": 1, "paths": 1, "path_entries": 2,
+            "attempts": 1, "placements": 2,
+        }  # fmt: skip
+    for at in (7, 8):
+        with Map.open(stored, at=at) as store:
+            assert gone not in {one.session for one in store.load().nodes}
+            assert store.lookups.forgotten([gone]) == ({gone} if at == 8 else set())
 
 
 @pytest.mark.parametrize(("at", "expected"), HASHES.items())

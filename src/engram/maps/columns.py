@@ -13,7 +13,7 @@ from sqlalchemy import Connection, Select, Table, bindparam, func, select
 from engram import _core
 from engram.errors import MapCorruptError
 from engram.maps.rows import Row, describe, mismatch, verified
-from engram.maps.schema import attempts, edges, hidden, nodes, path_entries, revisions
+from engram.maps.schema import attempts, edges, hidden, nodes, path_entries, receipts, revisions
 from engram.maps.view import LARGEST_KEY, View, place_in_history, places_in_history
 
 Keys = NDArray[np.int64]
@@ -24,6 +24,12 @@ _SAID = (
     .where(hidden.c.record == bindparam("record"))
     .where(hidden.c.target.between(bindparam("first"), bindparam("last")))
     .order_by(hidden.c.key)
+)
+# What was erased was hidden first: older views show none of it, either.
+_ERASED = (
+    select(receipts.c.target)
+    .where(receipts.c.record == bindparam("record"))
+    .where(receipts.c.target.between(bindparam("first"), bindparam("last")))
 )
 # The tables of which rows were ever hidden: a look-up each, where DISTINCT would read all.
 _RECORDS = """
@@ -145,12 +151,14 @@ class Visible:
         ask: gives rows of `_SAID`.
         records: the tables that have rows which were ever hidden, by name.
         until: largest key of the rows that are shown, by name of the table; of other tables all.
+        after_erasure: whether the map has erased rows that no visible revision hides.
     """
 
     places: Mapping[int, int]
     ask: Ask
     records: frozenset[str]
     until: Mapping[str, int] = field(default_factory=dict)
+    after_erasure: bool = False
     _hidden: dict[str, frozenset[int]] = field(default_factory=dict)
 
     @staticmethod
@@ -165,6 +173,8 @@ class Visible:
         query = select(revisions.c.key, revisions.c.status, place_in_history())
         known = connection.execute(query.order_by(revisions.c.key)).fetchall()
         records = frozenset(connection.exec_driver_sql(_RECORDS).scalars())
+        newest = max((place for _, status, place in known if status == "committed"), default=0)
+        erased = connection.execute(select(receipts.c.key).limit(1)).first() is not None
         found = []
         for view in views:
             places = {
@@ -172,7 +182,9 @@ class Visible:
                 for key, status, place in known
                 if key == view.own or (status == "committed" and place <= view.at)
             }
-            found.append(Visible(places, ask or connection.execute, records))
+            after = erased and view.at < newest
+            asks = ask or connection.execute
+            found.append(Visible(places, asks, records, after_erasure=after))
         return found
 
     def as_of_now(self, connection: Connection) -> Visible:
@@ -199,10 +211,10 @@ class Visible:
         """(N,) whether the rows with these keys, (N,), are hidden."""
         gone = self._hidden.get(table.name)
         if gone is None:
-            gone = self._hides(table, stretches(keys))
+            gone = self._hides(table, list(stretches(keys)))
         return np.isin(keys, list(gone)) if gone else np.zeros(len(keys), np.bool_)
 
-    def _hides(self, table: Table, within: Iterable[tuple[int, int]]) -> frozenset[int]:
+    def _hides(self, table: Table, within: Sequence[tuple[int, int]]) -> frozenset[int]:
         if table.name not in self.records:
             return frozenset()
         newest: dict[int, tuple[int, int]] = {}
@@ -213,7 +225,11 @@ class Visible:
                 place = self.places.get(revision, -1)
                 if key <= last_key and place >= newest.get(target, (0, 0))[0]:
                     newest[target] = place, hides
-        return frozenset(target for target, (_, hides) in newest.items() if hides)
+        gone = {target for target, (_, hides) in newest.items() if hides}
+        for first, last in within if self.after_erasure else ():
+            asked = {"record": str(table.name), "first": first, "last": last}
+            gone |= {target for (target,) in self.ask(_ERASED, asked)}
+        return frozenset(gone)
 
     def rows(self, connection: Connection, table: Table) -> Iterator[Row]:
         """The visible rows of a table without references to nodes, verified, by key."""

@@ -88,6 +88,8 @@ class FrameReader:
         if held is not None:
             return held.thumbnail
         key = self._node_row(node)[0]["key"]
+        if key in self._without_pictures:
+            return None
         with self._database.reading() as connection:
             rows = connection.execute(select(frames).where(frames.c.node == key))
             row = next(verified(frames, rows), None)
@@ -190,6 +192,7 @@ class FrameReader:
             (seen,) = Visible.of(connection, view)
             self._revisions = frozenset(seen.places)
             self._hidden = seen.hidden_of(nodes)
+            self._without_pictures = seen.hidden_of(frames)
             self._cameras: dict[int, StereoCamera] = load_cameras(connection)
             self._frontends: dict[int, tuple[DescriptorKind, str]] = load_frontends(connection)
 
@@ -244,7 +247,7 @@ class FrameReader:
             status=FrameStatus(row["status"]),
             landmark_hash=row["landmark_hash"],
             landmarks=blob,
-            thumbnail=frame["thumbnail"],
+            thumbnail=None if row["key"] in self._without_pictures else frame["thumbnail"],
         )
 
     def _remember(self, node: NodeId, frame: Frame) -> None:

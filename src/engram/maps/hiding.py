@@ -6,6 +6,7 @@ later are shown by a newer `hidden` row; of the rows for one target the newest c
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +31,7 @@ from engram.maps.schema import (
     omissions,
     path_entries,
     paths,
+    receipts,
     revisions,
     sessions,
 )
@@ -223,6 +225,8 @@ def _invert_hidden(
     if not made:
         return 0
     newest = {(row["record"], row["target"]): row for row in view.rows(connection, hidden)}
+    made = [row for row in made if newest[row["record"], row["target"]]["key"] == row["key"]]
+    _check_not_erased(connection, made)
     rows = [
         hidden_row(
             keys,
@@ -232,11 +236,28 @@ def _invert_hidden(
             hide=not row["hidden"],
         )
         for row in made
-        if newest[row["record"], row["target"]]["key"] == row["key"]
     ]
     if rows:
         connection.execute(insert(hidden), rows)
     return len(rows)
+
+
+def _check_not_erased(connection: Connection, made: list[Row]) -> None:
+    """Refuses to show again what is no longer there.
+
+    Raises:
+        RevisionError: a row was erased.
+    """
+    targets = defaultdict(list)
+    for row in made:
+        targets[row["record"]].append(row["target"])
+    for record, keys in targets.items():
+        for part in few(keys):
+            erased = (receipts.c.record == record) & receipts.c.target.in_(part)
+            if connection.execute(select(receipts.c.key).where(erased).limit(1)).first():
+                raise RevisionError(
+                    "it forgot what has been erased since: nothing brings that back"
+                )
 
 
 def compare(connection: Connection, number: int, before: int, after: Revision) -> Reverted:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from engram.graph.model import (
 )
 from engram.graph.paths import Attempts
 from engram.maps.attempts import unpack_drive
+from engram.maps.forgetting import forgotten_of
 from engram.maps.map_frame import Moves, moves
 from engram.maps.marks import counting
 from engram.maps.reading import load_cameras
@@ -95,6 +97,17 @@ class Lookups:
             held = zip(records, rows, strict=True)
             return {node.id: HeldNode(node, row["landmark_hash"], row["key"]) for node, row in held}
 
+    def node_keys(self, drives: Iterable[SessionId], some: Iterable[NodeId]) -> NDArray[np.int64]:
+        """(N,) keys, rising, of the nodes of some sessions and of some others that the map has."""
+        keys: list[int] = []
+        with self._database.reading() as connection:
+            for part in few([one.bytes for one in drives]):
+                owners = select(sessions.c.key).where(sessions.c.uuid.in_(part))
+                query = self._view.select(nodes).where(nodes.c.session.in_(owners))
+                keys += connection.execute(query.with_only_columns(nodes.c.key)).scalars()
+            keys += [row["key"] for row in self._named(connection, nodes, some)]
+        return np.unique(np.array(keys, np.int64))
+
     def omissions(self, some: Iterable[NodeId]) -> dict[NodeId, Omission]:
         """Those of some nodes that the map omitted, each with its newest visible equivalent."""
         some = list(some)
@@ -113,9 +126,12 @@ class Lookups:
         return found
 
     def known(self, some: Sequence[bytes]) -> frozenset[bytes]:
-        """The UUIDs whose nodes the map has or omitted, and which need not be handed in."""
+        """The UUIDs of nodes that the map has, omitted or forgot, and of sessions that it forgot.
+
+        Nothing of these need be handed in.
+        """
         with self._database.reading() as connection:
-            return frozenset(
+            return frozenset(forgotten_of(connection, self._view, some)).union(
                 uuid
                 for table in (nodes, omissions, omitted_landmarks)
                 for part in few(some)
@@ -125,6 +141,12 @@ class Lookups:
                     .where(table.c.uuid.in_(part))
                 ).scalars()
             )
+
+    def forgotten(self, some: Iterable[SessionId | NodeId]) -> frozenset[UUID]:
+        """Those of some sessions and nodes that the map has forgotten."""
+        with self._database.reading() as connection:
+            found = forgotten_of(connection, self._view, [one.bytes for one in some])
+        return frozenset(UUID(bytes=uuid) for uuid in found)
 
     def landmark_hashes(self, some: Iterable[NodeId]) -> dict[NodeId, bytes]:
         """Hash (16 bytes) of the landmarks of some nodes that the map has, or had omitted."""

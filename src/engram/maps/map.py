@@ -27,6 +27,7 @@ from engram.graph.model import (
     LONGEST_NAME,
     Amendable,
     Amendment,
+    Edge,
     NodeId,
     Placement,
     Session,
@@ -47,6 +48,14 @@ from engram.maps.checking import check
 from engram.maps.content import content_hash, record_hashes, verified_hash
 from engram.maps.counting import info, totals_of
 from engram.maps.difference import STRETCH_M, MapDifference, difference
+from engram.maps.forgetting import (
+    Chosen,
+    Forgotten,
+    hide_chosen,
+    load_names,
+    result_of,
+    write_bridges,
+)
 from engram.maps.frame_reader import DEFAULT_CACHE_BYTES, FrameReader
 from engram.maps.hiding import Reverted, compare, hide_revision
 from engram.maps.laying_out import new_places
@@ -132,6 +141,7 @@ def checked_amendments(
 
 
 _P = ParamSpec("_P")
+_Hidden = TypeVar("_Hidden", Reverted, Forgotten)
 _T = TypeVar("_T")
 
 
@@ -431,6 +441,7 @@ class Map:
     omissions = _kept(reading.load_omissions)
     landmark_hashes = _kept(reading.landmark_hashes)
     partial_paths = _kept(reading.partial_paths)
+    forgotten = _kept(load_names)
 
     @cached_property
     def placements(self) -> dict[NodeId, SE3]:
@@ -795,28 +806,57 @@ class Map:
                 being written.
             StorageFullError: no space; the map is unchanged.
         """
-        self._check_none_open()
         number = self.resolve(named)
         if number == 0:
             raise RevisionError(f"{self._database.name}: there is no revision 0 to revert")
         said = f"revert revision {number}" + (f": {message}" if message else "")
-        opened = new_revision(self._keys, self._holder, author, said, {"revert": number})
-        try:
-            with self._database.writing() as connection:
-                connection.execute(insert(revisions), [sealed(revisions, opened)])
-                own = View(self._view.at, opened["key"])
-                hide_revision(connection, self._keys, own, number, opened["key"])
-                revision = commit_revision(connection, opened, *brought(connection, opened))
-                done = compare(connection, number, self.revision, revision)
-                if dry_run:
-                    raise _DryRunError
-        except _DryRunError:
-            return replace(done, revision=None)
-        self.frames.forget()
-        self.forget()
-        self._keys.forget_nodes()
-        self._see(View(self.resolve(None)))
-        return done
+
+        def reverted(connection: Connection, own: View, row: Row) -> Reverted:
+            hide_revision(connection, self._keys, own, number, row["key"])
+            revision = commit_revision(connection, row, *brought(connection, row))
+            return compare(connection, number, self.revision, revision)
+
+        about = {"author": author, "message": said, "configuration": {"revert": number}}
+        return self._hide(reverted, about, dry_run=dry_run)
+
+    @_writes
+    def forget_nodes(
+        self,
+        chosen: Chosen,
+        bridges: Sequence[Edge] = (),
+        *,
+        author: str,
+        message: str,
+        configuration: Mapping[str, Any],
+        dry_run: bool = False,
+    ) -> Forgotten:
+        """Forgets nodes, by a revision that hides them; `erase_map` then removes their bytes.
+
+        What is forgotten is not taken in again until that revision is reverted.
+
+        Args:
+            chosen: what goes.
+            bridges: edges over it between nodes that stay.
+            author: the person or robot.
+            message: reason.
+            configuration: how it was chosen, plain JSON data.
+            dry_run: only report the result.
+
+        Raises:
+            RevisionError: there is nothing to forget, or a session is being written.
+            StorageFullError: no space; the map is unchanged.
+        """
+
+        def forgotten(connection: Connection, own: View, row: Row) -> Forgotten:
+            gone = hide_chosen(connection, self._keys, own, row["key"], chosen)
+            if not any(gone.values()):
+                raise RevisionError(f"{self.location} holds nothing of what is to be forgotten")
+            write_bridges(connection, self._keys, row["key"], bridges)
+            revision = commit_revision(connection, row, *brought(connection, row))
+            return result_of(connection, revision.number, gone, len(bridges))
+
+        about = {"author": author, "message": message, "configuration": configuration}
+        return self._hide(forgotten, about, dry_run=dry_run)
 
     @_writes
     def put_words(self, vocabulary: bytes, found: Mapping[NodeId, NDArray[np.int32]]) -> None:
@@ -965,6 +1005,36 @@ class Map:
             return collect_abandoned(connection)
 
     # -- inside
+
+    def _hide(
+        self,
+        write: Callable[[Connection, View, Row], _Hidden],
+        about: Mapping[str, Any],
+        *,
+        dry_run: bool,
+    ) -> _Hidden:
+        """Commits a revision that hides rows, in one transaction.
+
+        Args:
+            write: writes and commits it, given its view and its row; returns what was done.
+            about: author, message and configuration.
+            dry_run: undo all of it; the result then has no revision.
+        """
+        self._check_none_open()
+        row = new_revision(self._keys, self._holder, **about)
+        try:
+            with self._database.writing() as connection:
+                connection.execute(insert(revisions), [sealed(revisions, row)])
+                done = write(connection, View(self._view.at, row["key"]), row)
+                if dry_run:
+                    raise _DryRunError
+        except _DryRunError:
+            return replace(done, revision=None)
+        self.frames.forget()
+        self.forget()
+        self._keys.forget_nodes()
+        self._see(View(self.resolve(None)))
+        return done
 
     @property
     def _holder(self) -> Holder:

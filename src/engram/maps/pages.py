@@ -289,7 +289,10 @@ class MapPages:
             rows = self._attempt_rows(np.unique(page_of(some + 1)).tolist())
             for session, own in groupby(rows, key=itemgetter("session")):
                 made = unpack_drive(list(own))
-                made = made.rows(np.flatnonzero(chosen[made.reference] & chosen[made.node]))
+                ends = np.stack([made.reference, made.node]).astype(np.int64)
+                known = ends <= self.end  # those of erased nodes may be beyond
+                seen = known & chosen[np.where(known, ends, 0)]
+                made = made.rows(np.flatnonzero(seen.all(axis=0)))
                 parts.append(
                     replace(
                         made,

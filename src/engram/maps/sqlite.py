@@ -11,22 +11,29 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, Engine, SelectBase, Table, delete, event, insert
 from sqlalchemy.dialects.sqlite import Insert
-from sqlalchemy.exc import NoResultFound
+from sqlalchemy.exc import NoResultFound, OperationalError
 from sqlalchemy.sql.compiler import SQLCompiler
 
 from engram import __version__
-from engram.errors import EngramError, MapCorruptError, MapError, NotAMapError, StorageFullError
+from engram.errors import (
+    EngramError,
+    MapCorruptError,
+    MapError,
+    MapLockedError,
+    NotAMapError,
+    StorageFullError,
+)
 from engram.files import Holder, WriterLock, current_holder, naming, new_file, publish
 from engram.maps.rows import count_tags, sealed
 from engram.maps.schema import FORMAT_VERSION, map_format, metadata
-from engram.sqlite import FileKind, SqliteFile
+from engram.sqlite import FileKind, SqliteFile, is_full
 
 _STUMBLES = (TypeError, ValueError, LookupError, ArithmeticError, NoResultFound)
 
@@ -365,11 +372,59 @@ def _state(path: Path) -> tuple[int, int, int] | None:
     return found.st_ino, found.st_size, found.st_mtime_ns
 
 
-def _writing_engine(file: SqliteFile, options: str) -> Engine:
-    engine = file.engine(options)
+def _writing_engine(
+    file: SqliteFile,
+    options: str,
+    prepare: Callable[[sqlite3.Connection], object] | None = None,
+) -> Engine:
+    engine = file.engine(options, prepare)
     # Takes the write lock at once: a transaction that asks for it later can fail half way.
     event.listen(engine, "begin", lambda one: one.exec_driver_sql("BEGIN IMMEDIATE"))
     return engine
+
+
+# How long to wait for a process that is just closing the map.
+_PATIENCE_MS = 1000
+
+
+@contextmanager
+def alone(path: Path) -> Iterator[Engine]:
+    """The only connection to a map: no process has it open, or can open it meanwhile.
+
+    What is deleted is overwritten with zeros.
+
+    Raises:
+        MapLockedError: another process has it open, or this one.
+    """
+    file = SqliteFile(path, MAP_FILE)
+    engine = _writing_engine(file, "mode=rw", _prepare_alone)
+    with damage_named(str(path)), file.errors():
+        try:
+            with engine.connect():
+                pass
+        except (OperationalError, sqlite3.OperationalError) as error:
+            if is_full(getattr(error, "orig", error)):
+                raise
+            raise MapLockedError(f"{path} is open elsewhere; close it there first") from error
+        try:
+            yield engine
+        finally:
+            engine.dispose()
+
+
+def _prepare_alone(connection: sqlite3.Connection) -> None:
+    connection.execute(f"PRAGMA busy_timeout={_PATIENCE_MS}")
+    connection.execute("PRAGMA locking_mode=EXCLUSIVE")
+    connection.execute("PRAGMA secure_delete=ON")
+    connection.execute("BEGIN EXCLUSIVE")  # takes the lock, which the next line keeps
+    connection.execute("COMMIT")
+
+
+def compact(engine: Engine) -> None:
+    """Rewrites a map that is `alone`, without free pages, and empties its log."""
+    with closing(engine.raw_connection()) as connection:
+        connection.execute("VACUUM")
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
 
 def keep_log(file: SqliteFile) -> None:

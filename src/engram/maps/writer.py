@@ -34,6 +34,7 @@ from engram.graph.placing import DEFAULT_CONFIG as PLACING
 from engram.graph.placing import PlacingConfig
 from engram.maps import reading
 from engram.maps.columns import Visible
+from engram.maps.forgetting import Chosen, forgotten_of, hide_chosen
 from engram.maps.frame_reader import FrameReader
 from engram.maps.hiding import check_same_node, check_same_session, hidden_row, hidden_rows
 from engram.maps.marks import mark_row
@@ -53,6 +54,7 @@ from engram.maps.rows import check_edge, checked_int, session_row, to_json, tran
 from engram.maps.schema import (
     amendments,
     cameras,
+    forgotten,
     frames,
     frontends,
     goals,
@@ -73,6 +75,7 @@ from engram.maps.view import KeyBook, View
 
 # Most bytes in memory of a revision that is not resumable.
 _BATCH_BYTES = 8 * 2**20
+_FORGETS = "SELECT EXISTS (SELECT 1 FROM forgotten)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +164,7 @@ class RevisionWriter:
                 table: hidden_rows(connection, seen, table) for table in (sessions, nodes, paths)
             }
             self._interrupted = open_sessions(connection)
+            self._forgets = bool(connection.exec_driver_sql(_FORGETS).scalar())
         self._omitted: set[bytes] = set()
         self._amended: set[Amendment] | None = None  # read on first use
         self._shows_again = False
@@ -204,6 +208,7 @@ class RevisionWriter:
                 f"session {session.id} was interrupted in this map; resume it or seal what is "
                 "there first"
             )
+        self._check_not_forgotten(session.id, "session")
         if self._descriptor not in {None, descriptor}:
             raise IncompatibleError(
                 f"{self._database.name} holds {self._descriptor} descriptors, session "
@@ -267,6 +272,7 @@ class RevisionWriter:
         self._check_open()
         node = stored.node
         self._known.check_node(stored)
+        self._check_not_forgotten(node.id, "node")
         again = self._hidden[nodes].get(node.id.bytes)
         if again is not None:
             check_same_node(again, node, stored.landmark_hash)
@@ -442,6 +448,22 @@ class RevisionWriter:
         self._rows.new(vocabularies, len(body), hash=content_digest(body), body=body)
         self._checkpoint_if_due()
 
+    def forget(self, chosen: Chosen, bridges: Sequence[Edge]) -> None:
+        """Forgets nodes, after all else; see `Map.forget_nodes`."""
+        for bridge in bridges:
+            self.add_edge(bridge)
+        self.checkpoint()
+        with self._database.writing() as connection:
+            hide_chosen(connection, self._keys, self._view, self._revision_key, chosen)
+
+    def add_forgotten(self, names: Mapping[Table, Sequence[bytes]]) -> None:
+        """Names sessions and nodes, by UUID, that may not be taken in; see `Map.forgotten`."""
+        self._check_open()
+        for table, uuids in names.items():
+            for uuid in uuids:
+                self._rows.new(forgotten, record=str(table.name), uuid=uuid)
+                self._checkpoint_if_due()
+
     @property
     def session(self) -> Session:
         """The drive of a resumable revision."""
@@ -552,6 +574,16 @@ class RevisionWriter:
         # A resumed session must not begin in the middle of a frame's records.
         if not self.resumable and self._rows.size_bytes > _BATCH_BYTES:
             self.checkpoint()
+
+    def _check_not_forgotten(self, one: SessionId | NodeId, what: str) -> None:
+        if not self._forgets:
+            return
+        with self._database.reading() as connection:
+            if forgotten_of(connection, self._view, [one.bytes]):
+                raise InputError(
+                    f"{what} {one} was forgotten in {self._database.name} and is not taken in "
+                    "again; engram log says why"
+                )
 
     def _add_path(self, path: PathId, session_key: int, partial: bool) -> None:
         key = self._shown_again(paths, path.bytes)

@@ -3,7 +3,8 @@
     python -m tests.maps.data.make_map FILE
 
 One map with a row of every kind: two drives, the second reverted and mapped again, one that was
-interrupted, a superseded edge, an omission, an amendment, marks, words, places and tags.
+interrupted, one that was forgotten and erased, a superseded edge, an omission, an amendment, marks,
+words, places and tags.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from engram.graph.model import (
     Placement,
     Removal,
 )
+from engram.maps.forgetting import Chosen, erase_map
 from engram.maps.map import Map
 from engram.maps.place_blocks import BODY, NUMBERS, UNREADABLE
 
@@ -69,6 +71,13 @@ def write_map(path: Path | str) -> None:
             writer.add_mark(Anchor(drive.nodes[0].id, 1.0, 2.0, None, 0.5, "a test"))
             writer.add_mark(Goal("dock", drive.nodes[1].id, SE3.identity()))
             writer.commit()
+        fifth = begin(store, session("robot-5"))
+        write_drive(fifth, 2)
+        fifth.commit()
+        forgotten = Chosen(sessions=frozenset([fifth.session.id]))
+        store.forget_nodes(forgotten, author=AUTHOR, message="forget: a test", configuration={})
+    erase_map(Path(path))
+    with Map.open(path, writes=True) as store:
         third = begin(store, session("robot-3"))
         write_drive(third, 2)
         third.checkpoint()
