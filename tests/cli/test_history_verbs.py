@@ -166,3 +166,31 @@ def test_nodes_are_listed_with_their_drives(engram, town: Path) -> None:
     found = engram("info", town, "--nodes", "--json").json
     assert len(found["node_list"]) == found["nodes"]
     assert {one["robot"] for one in found["node_list"]} <= {"r1", "r2"}
+
+
+def test_forgetting_is_previewed_then_done_undone_and_erased(engram, town: Path) -> None:
+    asked = ("forget", town, "--session", engram("info", town, "--sessions", "--json").json[
+        "session_list"
+    ][0]["session"][:8])  # fmt: skip
+    before = engram("check", town, "--json").json["rows"]
+    preview = engram(*asked)
+    assert "would go: 1 session" in preview.out
+    assert "previewed only: --yes does it" in preview.out
+    assert engram("log", town, "--json").json[0]["number"] == 2
+    done = engram(*asked, "--yes", "--message", "asked by the owner")
+    assert "forgotten by revision 3: 1 session" in done.out
+    assert engram("log", town, "--json").json[0]["message"] == "forget: asked by the owner"
+    assert done.out.splitlines()[-1] == f"to undo: engram revert {town} 3"
+    assert engram("revert", town, 3).status == 0
+    assert engram(*asked, "--yes", "--json").json["forgotten"]["revision"] == 5
+    assert "would be erased: " in engram("forget", town, "--erase").out
+    erased = engram("forget", town, "--erase", "--yes", "--json").json
+    assert erased["forgotten"] is None
+    assert erased["erased"]["rows"]["sessions"] == 1
+    assert erased["erased"]["after_bytes"] < erased["erased"]["before_bytes"]
+    refused = engram("revert", town, 5)
+    assert (refused.status, "erased since" in refused.err) == (2, True)
+    assert engram("check", town).status == 0
+    assert engram("check", town, "--json").json["rows"] > before
+    assert engram("forget", town).status == 2
+    assert "--region is" in engram("forget", town, "--region", "1,2").err

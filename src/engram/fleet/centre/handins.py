@@ -47,9 +47,9 @@ from engram.fleet.transfers import (
     decode_page,
     encode_manifest,
 )
-from engram.maps.schema import frames, nodes, vocabularies
+from engram.maps.schema import frames, nodes, sessions, vocabularies
 
-_PAGED = {table.name: table for table in (nodes, frames, vocabularies)}
+_PAGED = {table.name: table for table in (sessions, nodes, frames, vocabularies)}
 
 
 def handin_id(name: str, robot: str, manifest: str) -> str:
@@ -269,6 +269,10 @@ def wanted_parts(centre: Centre, row: HandIn) -> list[PartHash]:
     return _not_given(centre, row, list(dict.fromkeys(blobs)))
 
 
+# Of a row of nodes.
+_SESSION = nodes.columns.keys().index("session")
+
+
 def _blobs_needed(
     centre: Centre, row: HandIn, manifest: Manifest, pages: set[PartHash] | None = None
 ) -> list[PartHash]:
@@ -293,9 +297,13 @@ def _blobs_needed(
             except MapCorruptError as error:
                 raise MalformedError(str(error)) from error
 
-    own = {node[1]: node[0] for node in rows("nodes", None)}
+    own = {node[1]: (node[0], node[_SESSION]) for node in rows("nodes", None)}
+    drives = {drive[0]: drive[1] for drive in rows("sessions", None)}
     with centre.reading(row.map) as store:
-        held = {own[uuid] for uuid in store.lookups.known(list(own))}
+        known = store.lookups.known([*own, *drives.values()])
+    held = {
+        key for uuid, (key, drive) in own.items() if known.intersection((uuid, drives.get(drive)))
+    }
     found = []
     for frame in rows("frames", pages):
         if frame[0] not in held:

@@ -8,12 +8,13 @@ import typer
 
 from engram.fleet.cli.agent_verbs import agent_group
 from engram.fleet.cli.centre_verbs import centre_group
-from engram.fleet.cli.verbs import build, download, dream, merge
+from engram.fleet.cli.verbs import build, download, dream, forget, merge
 
 FLEET_VERBS: dict[str, Callable[..., None]] = {
     "merge": merge,
     "download": download,
     "build": build,
     "dream": dream,
+    "forget": forget,
 }
 FLEET_GROUPS: dict[str, typer.Typer] = {"centre": centre_group, "agent": agent_group}

@@ -1,4 +1,4 @@
-"""`engram merge`, `download`, `build`, `dream`: the fleet map."""
+"""`engram merge`, `download`, `build`, `dream`, `forget`: the fleet map."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from engram.cli import options
-from engram.cli.history import AUTHOR
+from engram.cli.history import AUTHOR, Message, user
 from engram.cli.options import ExitStatus, PartlyDoneError, VerbInterruptedError
 from engram.errors import ConfigError, EngramError
 
@@ -431,3 +431,70 @@ def dream(
             centre, handed or hand_ins_of(centre), validate, given.of_robot(), asked, monitor
         )
     options.show(report, as_json=as_json)
+
+
+def forget(
+    map_path: options.MapPath,
+    *,
+    session: Annotated[
+        list[str] | None,
+        typer.Option("--session", metavar="ID", help="This drive; repeatable."),
+    ] = None,
+    region: Annotated[
+        str | None,
+        typer.Option(
+            "--region", metavar="X,Y,R", help="What lies R metres around a point of the map frame."
+        ),
+    ] = None,
+    older_than: Annotated[
+        str | None,
+        typer.Option("--older-than", metavar="AGE", help="Drives of that age: 90d."),
+    ] = None,
+    pictures: Annotated[
+        bool, typer.Option("--pictures", help="Only the pictures of all this.")
+    ] = False,
+    erase: Annotated[
+        bool, typer.Option("--erase", help="Erase all that is forgotten, permanently.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do it; without, it is previewed.")] = False,
+    message: Message = "",
+    as_json: options.Json = False,
+) -> None:
+    """Forget drives, places or pictures.
+
+    What all the options hold for is hidden by a revision, which engram revert can undo, and is not
+    taken in again by merges. Edges are composed over it. Robots forget it with their next download.
+    --erase removes the bytes of all that is forgotten, whenever that was; receipts stay, by which
+    engram check still verifies the history. Close the map everywhere else first.
+
+    \b
+    Examples:
+      engram forget fleet.engram --session 5f3a
+      engram forget fleet.engram --region 120,-40,30 --yes --message "asked by the owner"
+      engram forget fleet.engram --older-than 90d --pictures --yes
+      engram forget fleet.engram --erase --yes
+    """
+    from engram.cli.wording import undo_text
+    from engram.fleet.forgetting import Retention, age_from_text, region_from_text
+    from engram.fleet.forgetting import forget as forget_in
+    from engram.maps.forgetting import Erased, Forgotten, erase_map
+
+    retention = Retention(
+        tuple(session or ()), region_from_text(region), age_from_text(older_than), pictures
+    )
+    hidden: Forgotten | None = None
+    erased: Erased | None = None
+    if not erase or retention != Retention():
+        hidden = forget_in(map_path, retention, author=user(), why=message, dry_run=not yes)
+    if erase:
+        erased = erase_map(map_path, dry_run=not yes)
+    lines = [one.text() for one in (hidden, erased) if one is not None]
+    if not yes:
+        lines.append("previewed only: --yes does it")
+    elif hidden is not None and hidden.revision is not None and erased is None:
+        lines.append(undo_text(map_path, hidden.revision))
+    report = {
+        "forgotten": None if hidden is None else hidden.to_dict(),
+        "erased": None if erased is None else erased.to_dict(),
+    }
+    options.show(report, "\n".join(lines), as_json=as_json)

@@ -446,6 +446,7 @@ class Part:
     Attributes:
         sent: (N,) bool, which of its nodes go along.
         whole: whether omissions go along, as they do with a copy of everything.
+        refused: sessions and omitted nodes that do not go along.
     """
 
     stock: Stock
@@ -453,12 +454,22 @@ class Part:
     bridges: list[Edge]
     whole: bool
     thumbnails: bool
+    refused: frozenset[UUID] = frozenset()
 
     @staticmethod
     def of(stock: Stock, sent: Mask, *, whole: bool, thumbnails: bool) -> Part:
         """The part with these nodes; its gaps are closed (`close_gaps`)."""
         bridges = close_gaps(stock.node_ids, stock.edges, sent)
         return Part(stock, sent, bridges, whole, thumbnails)
+
+    def without(self, refused: frozenset[UUID]) -> Part:
+        """The part without some sessions and nodes, and without what is theirs."""
+        if not refused:
+            return self
+        kept = [not refused.intersection((node.id, node.session)) for node in self.stock.nodes]
+        sent = self.sent & np.array(kept, np.bool_)
+        bridges = close_gaps(self.stock.node_ids, self.stock.edges, sent)
+        return replace(self, sent=sent, bridges=bridges, refused=refused)
 
     def __len__(self) -> int:
         return int(self.sent.sum())
@@ -502,12 +513,21 @@ class Part:
     def entries(self) -> Iterator[PathEntry]:
         """Path entries at sent nodes, by path and sequence."""
         index, sent = self.stock.index, self.sent
-        return (entry for entry in self.stock.entries if sent[index[entry.node]])
+        refused = {path_id(one.id) for one in self.stock.sessions if one.id in self.refused}
+        return (
+            entry
+            for entry in self.stock.entries
+            if sent[index[entry.node]] and entry.path not in refused
+        )
 
     def omissions(self) -> list[Omission]:
         """Omissions that go along, by the UUID of the omitted node."""
         return (
-            [omission for _, omission in sorted(self.stock.store.omissions.items())]
+            [
+                omission
+                for omitted, omission in sorted(self.stock.store.omissions.items())
+                if omitted not in self.refused and self.sent[self.stock.index[omission.node]]
+            ]
             if self.whole
             else []
         )
@@ -521,7 +541,9 @@ class Part:
     def attempt_rows(self) -> NDArray[np.intp]:
         """(A,) intp: rows of the stock's attempts whose two nodes are sent."""
         made = self.stock.attempts
-        return np.flatnonzero(self.sent[made.reference] & self.sent[made.node])
+        return np.flatnonzero(
+            self.sent[made.reference] & self.sent[made.node] & ~self._refused[made.session]
+        )
 
     def add_session(self, writer: RevisionWriter, session: Session, partial: set[PathId]) -> bool:
         """Writes a session; returns whether it was new.
@@ -556,6 +578,7 @@ class Part:
         self.write_attempts(writer, self.attempt_rows())
         for omission in self.omissions():
             writer.add_omission(omission)
+        writer.add_forgotten(self.stock.store.forgotten)
         if self.stock.store.vocabulary is not None:
             writer.put_vocabulary(self.stock.store.vocabulary)
 
@@ -567,10 +590,15 @@ class Part:
             if len(own):
                 writer.copy_attempts(session.id, kept.rows(own), self.stock.node_ids)
 
+    @property
+    def _refused(self) -> Mask:
+        """(S,) bool, which sessions do not go along."""
+        return np.array([one.id in self.refused for one in self.stock.sessions], np.bool_)
+
     def _sessions_wanted(self) -> Mask:
         stock = self.stock
         if self.stock.whole and self.sent.all():
-            return np.ones(len(stock.sessions), np.bool_)
+            return ~self._refused
         wanted = np.zeros(len(stock.sessions), np.bool_)
         wanted[stock.session_of[self.sent]] = True
         wanted[stock.attempts.session[self.attempt_rows()]] = True
@@ -578,7 +606,7 @@ class Part:
             nodes = stock.on_path.get(path_id(session.id))
             if nodes is not None and self.sent[nodes].any():
                 wanted[at] = True
-        return wanted
+        return wanted & ~self._refused
 
 
 # The robot's map speaks of the fleet's frame if the nodes of both lie as near as this, metres.

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from engram.fleet.download.downloading import choose_part, revision_of, stocked
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Mask, Part, lacking_marks
 from engram.fleet.download.selections import SELECTIONS, check_options, facts_told
+from engram.fleet.forgetting import bridges_over
 from engram.fleet.merge.open_merge import FIRST_REPLAYED, position_of, uncertainty_m2
 from engram.graph.model import (
     Edge,
@@ -34,7 +36,9 @@ from engram.graph.model import (
     PathId,
     Removed,
     Session,
+    SessionId,
 )
+from engram.maps.forgetting import Chosen
 from engram.maps.map import Map
 from engram.maps.records import MapContents
 from engram.maps.writer import RevisionWriter
@@ -53,6 +57,7 @@ class UpdateReport:
         nodes, of_nodes: copied; those of the download.
         own_nodes: nodes of the robot's map that the download does not have.
         ties: new edges between own nodes and the nodes by which the fleet map replaced them.
+        forgotten: own nodes that the robot's map forgets, too, since the fleet map has.
     """
 
     out: Path
@@ -68,6 +73,7 @@ class UpdateReport:
     path_entries: int
     attempts: int
     ties: int
+    forgotten: int
     why: dict[str, Any]
 
     def to_dict(self) -> dict[str, Any]:
@@ -88,6 +94,8 @@ class UpdateReport:
                 f"{counted(self.path_entries, 'path entry')}, {counted(self.attempts, 'attempt')}; "
                 f"tied {counted(self.ties, 'own node')} to equivalents",
             ]
+        if self.forgotten:
+            lines.append(f"forgotten, as by the fleet: {counted(self.forgotten, 'own node')}")
         return "\n".join(lines + facts_told(self.why))
 
 
@@ -131,14 +139,31 @@ class _Update:
     """A part of the fleet map and the robot's map that receives it."""
 
     def __init__(self, part: Part, own: Map) -> None:
-        self._part, self._map = part, own
         self._stock = part.stock
+        self._part, self._map = part.without(_forgotten_by(own, part)), own
         self._own = own.load()
         self._own_nodes = len(self._own.nodes)
         self._counts = dict.fromkeys(
-            ("nodes", "sessions", "edges", "path_entries", "attempts", "ties"), 0
+            (
+                "nodes",
+                "sessions",
+                "edges",
+                "path_entries",
+                "attempts",
+                "ties",
+                "forgotten",
+            ),
+            0,
         )
-        _check_fits(part, own, self._own)
+        _check_fits(self._part, own, self._own)
+        self._forgotten = self._gone()
+        self._bridges = bridges_over(own, self._forgotten)
+        self._lost = {
+            node.id
+            for node in self._own.nodes
+            if node.id in self._forgotten.nodes or node.session in self._forgotten.sessions
+        }
+        self._counts["forgotten"] = len(self._lost)
 
     def report(
         self, out: Path, select: str, revision: int | None, why: dict[str, Any]
@@ -164,6 +189,9 @@ class _Update:
                 writer.checkpoint()
                 self._own = self._map.load()
             anything |= self._write_the_rest(writer)
+            if self._forgotten.sessions or self._forgotten.nodes:
+                writer.forget(self._forgotten, self._bridges)
+                anything = True
             monitor.check()
             revision = writer.commit().number if anything else None
         if self._stock.words is not None and revision is not None:
@@ -215,6 +243,13 @@ class _Update:
         }
         return bool(edges or ties or entries or len(attempts) or omissions or marks or learnt)
 
+    def _gone(self) -> Chosen:
+        """The own nodes and drives that the fleet has forgotten."""
+        held, drives = {node.id: node for node in self._own.nodes}, set(self._map.sessions)
+        gone = self._stock.store.lookups.forgotten([*held, *drives])
+        alone = (one for one in held.keys() & gone if held[one].session not in gone)
+        return Chosen(frozenset(drives & gone), frozenset(alone))
+
     def _lacking_nodes(self) -> Mask:
         known = {node.id for node in self._own.nodes}
         return np.array([node not in known for node in self._stock.node_ids], np.bool_)
@@ -231,7 +266,7 @@ class _Update:
     def _lacking_ties(self, copied: set[tuple[NodeId, NodeId, EdgeKind]]) -> Iterator[Edge]:
         """Matches of own nodes with the nodes by which the fleet map replaced them."""
         known = copied | {_key(edge) for edge in self._own.edges}
-        own = {node.id for node in self._own.nodes}
+        own = {node.id for node in self._own.nodes} - self._lost
         present = own | set(self._part.node_ids)
         fleet = self._stock.store.lookups
         held = fleet.nodes(own)
@@ -272,6 +307,14 @@ class _Update:
         named = np.array([place[session.id] for session in self._stock.sessions], np.int32)
         theirs = replace(made, session=named[made.session])
         return rows[theirs.lacking(remembered)]
+
+
+def _forgotten_by(own: Map, part: Part) -> frozenset[UUID]:
+    """What a robot's map has forgotten of a part: only its own revert brings that back."""
+    stock = part.stock
+    ids: list[SessionId | NodeId] = [one.id for one in stock.sessions]
+    ids += [*stock.node_ids, *(one.omitted for one in part.omissions())]
+    return own.lookups.forgotten(ids)
 
 
 def _key(edge: Edge) -> tuple[NodeId, NodeId, EdgeKind]:

@@ -96,9 +96,10 @@ def merge_one(
     report, was_empty = merge.report, centre.node_count() == 0
     report.notes = notes(merge, time.time_ns())
     nodes = robot.graph.nodes
-    new = [node for node in nodes if not merge.knows(node.id)]
+    report.forgotten = sum(map(merge.has_forgotten, nodes))
+    new = [node for node in nodes if not (merge.knows(node.id) or merge.has_forgotten(node))]
     report.known_omissions = sum(merge.has_omitted(node.id) for node in nodes)
-    report.known = len(nodes) - len(new) - report.known_omissions
+    report.known = len(nodes) - len(new) - report.known_omissions - report.forgotten
     report.changed = bool(new) or merge.has_more()
     if report.changed:
         check_readable(robot, new)
@@ -170,7 +171,7 @@ def _take_over(merge: Merge, new: Sequence[Node], replay: Replay) -> None:
         for segment in segments[session.id]:
             merge.report.segments.append(replay.segment(session, segment))
         late += _unite_path(merge, session, replay)
-    for amendment in merge.robot.amendments:
+    for amendment in merge.amendments:
         merge.writer.add_amendment(amendment)
     merge.add_entries(late)
     if merge.writer.shows_again:

@@ -19,6 +19,7 @@ from engram.frontend.frame import Frame
 from engram.geometry.se3 import SE3, propagate_covariance
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import (
+    Amendment,
     Clock,
     Edge,
     EdgeKind,
@@ -33,6 +34,7 @@ from engram.graph.model import (
     Removed,
     Session,
     SessionId,
+    path_id,
 )
 from engram.graph.paths import Attempts, PathMemory
 from engram.localiser.localisation import Position
@@ -123,7 +125,7 @@ class Merge:
         held: those of the robot's nodes that the fleet map had before.
         runs: which nodes of the fleet map were connected before.
         robot: the robot's map.
-        sessions: of the robot's map, in the order of their starts.
+        sessions: of the robot's map, but for forgotten ones, in the order of their starts.
         edges: of the robot's map, by their keys.
         taken: nodes taken in this merge.
         joined: the ends of edges that were added in this merge.
@@ -137,12 +139,14 @@ class Merge:
 
         self.centre = centre
         self.robot = robot
+        own = [*(node.id for node in robot.graph.nodes), *robot.omissions]
+        self._forgotten = centre.lookups.forgotten([*own, *robot.sessions])
         self.sessions = sorted(
-            robot.sessions.values(), key=lambda session: (session.start_ns, session.id)
+            (one for one in robot.sessions.values() if one.id not in self._forgotten),
+            key=lambda session: (session.start_ns, session.id),
         )
         self.edges = sorted(robot.graph.edges, key=_edge_key)
         self.report = MergeReport.of(robot)
-        own = [*(node.id for node in robot.graph.nodes), *robot.omissions]
         self.held = centre.lookups.nodes(own)
         self.runs = centre.lookups.runs()
         self.taken: set[NodeId] = set()
@@ -177,6 +181,10 @@ class Merge:
         """Whether the node was taken or omitted before."""
         return self.has(node) or node in self._omitted
 
+    def has_forgotten(self, node: Node) -> bool:
+        """Whether the fleet map has forgotten the robot's node, or its session."""
+        return node.id in self._forgotten or node.session in self._forgotten
+
     def equivalent(self, node: NodeId) -> Position | None:
         """Position of the node's camera in the fleet map: at itself or its equivalent."""
         return Position.at(node) if self.has(node) else self._omitted.get(node)
@@ -196,11 +204,15 @@ class Merge:
         """Whether a map without new nodes has other new records."""
         paths = self.robot.path_memory
         return (
-            any(session not in self.centre.sessions for session in self.robot.sessions)
-            or any(self.new_entry(entry) for path in paths.paths for entry in paths.entries(path))
+            any(session.id not in self.centre.sessions for session in self.sessions)
+            or any(
+                self.new_entry(entry)
+                for session in self.sessions
+                for entry in paths.entries(path_id(session.id))
+            )
             or any(map(self.lacks_edge, self.edges))
             or any(map(self.lacks_omission, self.robot.omissions))
-            or not set(self.robot.amendments) <= set(self.centre.amendments)
+            or not set(self.amendments) <= set(self.centre.amendments)
             or any(self.new_removals())
             or any(self.new_goals())
             or len(self.new_attempts()) > 0
@@ -215,6 +227,11 @@ class Merge:
             and self.graph.find_edge(edge.a, edge.b, edge.kind) is None
             and edge not in self.removed
         )
+
+    @property
+    def amendments(self) -> list[Amendment]:
+        """The robot's amendments of `sessions`."""
+        return [one for one in self.robot.amendments if one.session not in self._forgotten]
 
     @cached_property
     def removed(self) -> Removed:
@@ -245,7 +262,9 @@ class Merge:
         """Position of a node that the robot's map omitted; None if the fleet map contains it."""
         omission = self.robot.omissions[omitted]
         known = self.equivalent(omission.node)
-        if known is None or self.knows(omitted) or omitted in self.robot.graph:
+        if known is None or self.knows(omitted) or omitted in self._forgotten:
+            return None
+        if omitted in self.robot.graph:
             return None
         return known.carried_on(omission.node_from_omitted, np.zeros((6, 6)))
 
@@ -281,7 +300,8 @@ class Merge:
         positions = [self.equivalent(node.id) for node in self.robot.graph.nodes]
         known = np.array([position is not None for position in positions], np.bool_)
         made = self.robot.attempts
-        made = made.rows(known[made.reference] & known[made.node])
+        drives = np.array([one not in self._forgotten for one in self.robot.sessions], np.bool_)
+        made = made.rows(known[made.reference] & known[made.node] & drives[made.session])
         remembered = self.centre.lookups.attempts(list(self.robot.sessions))
         new = made.rows(made.lacking(remembered))
         return new.moved_to(

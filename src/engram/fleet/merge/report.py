@@ -203,6 +203,7 @@ class MergeReport:
         interrupted: whether it was stopped; the fleet map is then unchanged by it.
         content_hash: of the fleet map afterwards; in a dry run, of the map that would result.
         known, known_omissions: nodes that the fleet map had, or had omitted before.
+        forgotten: nodes left out, since the fleet map has forgotten them or their drives.
         attempts: number of remembered attempts new to the fleet map.
         match_attempts: match attempts of the replay: the cost of the merge.
         proposed_attempts: those at nodes proposed by place recognition; each costs a quarter.
@@ -224,6 +225,7 @@ class MergeReport:
     sessions: int = 0
     known: int = 0
     known_omissions: int = 0
+    forgotten: int = 0
     taken: int = 0
     omitted: int = 0
     edges: int = 0
@@ -266,6 +268,10 @@ class MergeReport:
             lines += [_drive_text(drive) for drive in drives[:_SHOWN_DRIVES]]
             if len(drives) > _SHOWN_DRIVES:
                 lines.append(f"  … and {counted(len(drives) - _SHOWN_DRIVES, 'more drive')}")
+        if self.forgotten:
+            lines.append(
+                f"  left out, as forgotten by the fleet: {counted(self.forgotten, 'node')}"
+            )
         if self.held_out is not None:
             lines.append(f"  {self.held_out.text()}")
         if self.wrong_edges is not None:

@@ -1,0 +1,175 @@
+"""Retention: which drives, nodes and pictures a map forgets, and how the rest stays connected.
+
+What goes is chosen here; `engram.maps.forgetting` hides it, and erases it later. Edges are composed
+over what goes, as downloads compose them over what they leave out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from uuid import UUID
+
+import numpy as np
+
+from engram.config import plain
+from engram.errors import ConfigError, InputError
+from engram.fleet.download.part import close_gaps
+from engram.fleet.download.surroundings import Surroundings
+from engram.geometry.se3 import SE3
+from engram.graph.graph import EDGE_KINDS
+from engram.graph.model import Clock, Edge, NodeId, SessionId
+from engram.graph.pages import GraphPage
+from engram.maps.forgetting import Chosen, Forgotten
+from engram.maps.map import Map
+
+_NS_PER_DAY = 86_400 * 10**9
+
+
+@dataclass(frozen=True, slots=True)
+class Retention:
+    """What a map is to forget: what all that is given here holds for.
+
+    Attributes:
+        sessions: ids of drives, or their beginnings; none for all drives.
+        region: x, y and radius of a circle in the map frame, metres; None for everywhere.
+        older_than_days: age of drives from their starts; None for any. Drives whose time is unknown
+            are not old.
+        pictures: whether only pictures go.
+    """
+
+    sessions: Sequence[str] = ()
+    region: tuple[float, float, float] | None = None
+    older_than_days: float | None = None
+    pictures: bool = False
+
+    def chosen(self, store: Map, now_ns: int) -> Chosen:
+        """What that is in a map.
+
+        Args:
+            store: the map.
+            now_ns: the time, UTC.
+
+        Raises:
+            InputError: nothing is given, or a session is not in the map.
+        """
+        if self == Retention():
+            raise InputError(
+                "what is to be forgotten? Give --session, --region, --older-than or --pictures"
+            )
+        named = [store.named_session(one) for one in self.sessions]
+        drives = named or list(store.sessions.values())
+        if self.older_than_days is not None:
+            before_ns = now_ns - int(self.older_than_days * _NS_PER_DAY)
+            drives = [one for one in drives if one.clock is Clock.UTC and one.begin_ns < before_ns]
+        ids = frozenset(one.id for one in drives)
+        if self.region is None:
+            return Chosen(sessions=ids, pictures=self.pictures)
+        return Chosen(nodes=_within(store, self.region, ids), pictures=self.pictures)
+
+
+def _within(
+    store: Map, region: tuple[float, float, float], drives: frozenset[SessionId]
+) -> frozenset[NodeId]:
+    """The nodes of some drives that lie in a circle."""
+    x_m, y_m, radius_m = region
+    near = store.lookups.places_near(x_m, y_m, radius_m)
+    inside = [
+        node
+        for node, pose in near.items()
+        if np.hypot(pose.translation[0] - x_m, pose.translation[1] - y_m) <= radius_m
+    ]
+    held = store.lookups.nodes(inside)
+    return frozenset(node for node, one in held.items() if one.node.session in drives)
+
+
+def bridges_over(store: Map, chosen: Chosen) -> list[Edge]:
+    """Edges that keep connected what only these nodes connect; see `close_gaps`."""
+    seeds = store.lookups.node_keys(chosen.sessions, chosen.nodes) - 1
+    if chosen.pictures or not len(seeds):
+        return []
+    around = Surroundings.of(store.pages, store.lookups.runs(), seeds, 0.0).found
+    uuids = around.uuids.tobytes()
+    ids = [NodeId(UUID(bytes=uuids[16 * at : 16 * at + 16])) for at in range(len(around.nodes))]
+    return close_gaps(ids, _edges(around, ids), ~np.isin(around.nodes, seeds))
+
+
+def _edges(page: GraphPage, ids: Sequence[NodeId]) -> list[Edge]:
+    places = np.searchsorted(page.nodes, page.ends)
+    return [
+        Edge(ids[a], ids[b], EDGE_KINDS[kind], SE3(pose[:9].reshape(3, 3), pose[9:]), covariance)
+        for (a, b), kind, pose, covariance in zip(
+            places.tolist(), page.kinds.tolist(), page.poses, page.covariances, strict=True
+        )
+    ]
+
+
+def forget(
+    path: Path, retention: Retention, *, author: str, why: str = "", dry_run: bool = False
+) -> Forgotten:
+    """Forgets, by a revision that can be reverted; nothing is erased.
+
+    Args:
+        path: the map.
+        retention: what goes.
+        author: the person or robot.
+        why: the reason, for `log`.
+        dry_run: only report what would go.
+
+    Raises:
+        InputError: nothing is to be forgotten, or a session is not in the map.
+        RevisionError: the map holds nothing of it.
+        MapLockedError: another process writes to the map.
+    """
+    with Map.open(path, writes=True) as store:
+        chosen = retention.chosen(store, time.time_ns())
+        return store.forget_nodes(
+            chosen,
+            bridges_over(store, chosen),
+            author=author,
+            message="forget" + (f": {why}" if why else ""),
+            configuration={"forget": plain(retention)},
+            dry_run=dry_run,
+        )
+
+
+def region_from_text(text: str | None) -> tuple[float, float, float] | None:
+    """A region as it is typed, X,Y,R in metres; None for None.
+
+    Raises:
+        ConfigError: it is not one.
+    """
+    if text is None:
+        return None
+    x_m, y_m, radius_m = _numbers(text, 3, f"--region is {text!r:.40}, must be X,Y,R in metres")
+    return x_m, y_m, radius_m
+
+
+def age_from_text(text: str | None) -> float | None:
+    """Days of an age as it is typed, such as 90d; None for None.
+
+    Raises:
+        ConfigError: it is not one.
+    """
+    if text is None:
+        return None
+    fault = f"--older-than is {text!r:.40}, must be a number of days such as 90d"
+    (days,) = _numbers(text[:-1] if text.endswith("d") else "", 1, fault)
+    return days
+
+
+def _numbers(text: str, count: int, fault: str) -> list[float]:
+    """Numbers with commas between them, the last of which is a size.
+
+    Raises:
+        ConfigError: there is another number of them, or one is not finite.
+    """
+    try:
+        found = [float(one) for one in text.split(",")]
+    except ValueError as error:
+        raise ConfigError(fault) from error
+    if len(found) != count or not np.isfinite(found).all() or found[-1] <= 0:
+        raise ConfigError(fault)
+    return found

@@ -1,0 +1,170 @@
+"""What a fleet forgets: the rest stays connected, and nothing brings it back."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.maps.maps import begin, session
+
+from engram.errors import ConfigError, InputError, RevisionError
+from engram.fleet.download.downloading import download
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.updating import update
+from engram.fleet.forgetting import Retention, age_from_text, forget, region_from_text
+from engram.graph.model import EdgeKind
+from engram.maps.forgetting import erase_map
+from engram.maps.map import Map
+from engram.maps.map_files import check_file
+
+from .robots import DAY_NS, merged
+
+
+@pytest.fixture
+def centre(tmp_path: Path, fleet) -> Path:
+    """Three drives: the first 24 m, what follows to 40 m, and the first 24 m unlike."""
+    path = tmp_path / "centre.engram"
+    merged(path, *(fleet[name][0] for name in ("first", "longer", "other")))
+    return path
+
+
+def drive_of(path: Path, robot: str) -> str:
+    with Map.open(path) as store:
+        return next(str(one.id) for one in store.sessions.values() if one.robot == robot)
+
+
+def nodes_of(path: Path) -> dict:
+    """Nodes by session."""
+    found: dict = {}
+    with Map.open(path) as store:
+        for node in store.load().nodes:
+            found.setdefault(str(node.session), set()).add(node.id)
+    return found
+
+
+def test_what_passed_through_stays_connected(centre: Path, fleet) -> None:
+    with Map.open(centre) as store:
+        places, before = store.read_placements(), store.totals()
+        middle = sorted(one for one in fleet["longer"][1].saved if one in places)
+        middle = sorted(middle, key=lambda node: places[node].translation[0])
+        at = places[middle[len(middle) // 2]].translation[:2]
+    done = forget(centre, Retention(region=(*at.tolist(), 2.0)), author="tests")
+    assert done.nodes > 0
+    assert done.bridges > 0
+    assert done.components == (before.components, before.components)
+    with Map.open(centre) as store:
+        kinds = [edge.kind for edge in store.graph.edges]
+        assert kinds.count(EdgeKind.BRIDGE) == done.bridges
+        for node, pose in store.read_placements().items():
+            assert (pose.matrix() == places[node].matrix()).all()
+            assert np.hypot(*(pose.translation[:2] - at)) > 2.0
+        assert store.totals().nodes == before.nodes - done.nodes
+        store.revert("head", author="tests")
+        assert store.totals().agrees(before)
+    assert check_file(centre).problems == ()
+
+
+@pytest.mark.parametrize("erased", [False, True])
+def test_handed_in_again_what_was_forgotten_stays_forgotten(
+    centre: Path, tmp_path: Path, fleet, erased: bool
+) -> None:
+    gone = drive_of(centre, "r4")
+    before = nodes_of(centre)
+    forget(centre, Retention(sessions=(gone,)), author="tests", why="asked by the owner")
+    if erased:
+        erase_map(centre)
+    (report,) = merged(centre, fleet["other"][0])
+    assert (report.changed, report.taken) == (False, 0)
+    assert report.forgotten == len(fleet["other"][1].saved)
+    assert "left out, as forgotten by the fleet" in report.text()
+    # Of a map that holds more, the rest is merged.
+    both = tmp_path / "both.engram"
+    merged(both, fleet["other"][0], fleet["same"][0])
+    (report,) = merged(centre, both)
+    assert report.changed
+    assert report.sessions == 1
+    found = nodes_of(centre)
+    assert gone not in found
+    assert {one: found[one] for one in before if one != gone} == {
+        one: nodes for one, nodes in before.items() if one != gone
+    }
+    assert check_file(centre).problems == ()
+
+
+def test_robots_learn_of_it_with_their_next_download(centre: Path, tmp_path: Path, fleet) -> None:
+    robot, sent = tmp_path / "robot.engram", tmp_path / "sent.engram"
+    shutil.copy(fleet["other"][0], robot)
+    gone, own = drive_of(centre, "r4"), len(fleet["other"][1].saved)
+    forget(centre, Retention(sessions=(gone,)), author="tests")
+    erase_map(centre)
+    download(centre, sent, DownloadOptions())
+    assert gone not in nodes_of(sent)
+    done = update(sent, robot)
+    assert done.forgotten == own
+    assert gone not in nodes_of(robot)
+    assert check_file(robot).problems == ()
+    again = update(sent, robot)
+    assert (again.revision, again.forgotten) == (None, 0)
+    (report,) = merged(centre, robot)
+    assert not report.changed
+    # A download of the time before brings nothing back, either.
+    older = tmp_path / "older.engram"
+    merged(older, fleet["first"][0], fleet["other"][0])
+    update(older, robot)
+    assert gone not in nodes_of(robot)
+    assert check_file(robot).problems == ()
+
+
+def test_single_nodes_stay_forgotten_with_those_omitted_for_them(
+    centre: Path, tmp_path: Path, fleet
+) -> None:
+    merged(centre, fleet["same"][0])  # omitted for those of the first
+    with Map.open(centre) as store:
+        omitted = {one for one in fleet["same"][1].saved if one in store.omissions}
+        place = store.placements[store.omissions[min(omitted)].node].translation
+    done = forget(centre, Retention(region=(*place[:2].tolist(), 1.0)), author="tests")
+    erase_map(centre)
+    before = nodes_of(centre)
+    (first, same) = merged(centre, fleet["first"][0], fleet["same"][0])
+    assert first.forgotten > 0
+    assert same.forgotten > 0
+    assert done.nodes >= first.forgotten
+    assert nodes_of(centre) == before
+    robot = tmp_path / "robot.engram"
+    shutil.copy(fleet["first"][0], robot)
+    assert update(centre, robot).forgotten == first.forgotten
+    assert check_file(robot).problems == ()
+
+
+def test_old_drives_and_pictures_are_chosen(tmp_path: Path) -> None:
+    with Map.create(tmp_path / "town.engram") as store:
+        for day in range(3):
+            begin(store, session(f"r{day}", start_ns=day * DAY_NS)).commit()
+        for days, robots in ((3.5, set()), (2.5, {"r0"}), (0.5, {"r0", "r1", "r2"})):
+            old = Retention(older_than_days=days).chosen(store, 3 * DAY_NS)
+            assert {store.sessions[one].robot for one in old.sessions} == robots
+        every = Retention(pictures=True).chosen(store, 0)
+        assert every.sessions == store.sessions.keys()
+        assert every.pictures
+        with pytest.raises(InputError, match="0 sessions begin with"):
+            Retention(sessions=("xyz",), region=(0.0, 0.0, 1e6)).chosen(store, 0)
+        with pytest.raises(InputError, match="--older-than"):
+            Retention().chosen(store, 0)
+
+
+def test_where_nothing_lies_nothing_is_forgotten(centre: Path) -> None:
+    with pytest.raises(RevisionError, match="nothing of what is to be forgotten"):
+        forget(centre, Retention(region=(1e6, 1e6, 1.0)), author="tests")
+
+
+def test_regions_and_ages_are_read_as_typed() -> None:
+    assert region_from_text("120,-40.5,30") == (120.0, -40.5, 30.0)
+    assert age_from_text("90d") == 90.0
+    for text in ("", "1,2", "1,2,0", "1,2,nan", "a,b,c", "1,2,3,4"):
+        with pytest.raises(ConfigError, match="--region"):
+            region_from_text(text)
+    for text in ("", "90", "d", "-1d", "infd", "1w"):
+        with pytest.raises(ConfigError, match="--older-than"):
+            age_from_text(text)
