@@ -38,6 +38,7 @@ _DAY = datetime(2025, 7, 17, 11, tzinfo=UTC)
 _CONDITIONS = (
     ("dry", _DAY, "overcast", None),
     ("rain of 1 mm/h", _DAY, "rain", 1.0),
+    ("rain of 2 mm/h", _DAY, "rain", 2.0),
     ("rain of 4 mm/h", _DAY, "rain", 4.0),
     ("night", _DAY.replace(hour=23), "fair", None),
 )
