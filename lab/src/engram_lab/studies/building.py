@@ -20,7 +20,6 @@ from engram.localiser.localisation import Position
 from engram.maps.map import Map
 from engram.robot.mapping import Beginning, MapReport, map_drive
 from engram.robot.settings import RobotOptions, Settings
-from engram.sequences.framelog.reader import FrameLog
 from engram_lab.studies.drives import EvaluatedDrive, TrueNodes
 from engram_lab.studies.in_force import Values, of_revision, of_robot
 
@@ -90,7 +89,7 @@ def build_map(
         if before is not None:
             shutil.copyfile(before, draft)
         begin = partial(_begin, built, drive=drive, drives=(*drives, *known))
-        log = FrameLog(drive.path)
+        log = drive.log()
         try:
             report = map_drive(draft, log, settings, options, begin=begin)
         finally:
@@ -176,7 +175,7 @@ def _place(begun: Beginning, drive: EvaluatedDrive, drives: Sequence[EvaluatedDr
     truth = drive.truth()
     if truth is None or begun.resumed:
         return
-    log = FrameLog(drive.path)
+    log = drive.log()
     try:
         first = truth.at(int(log.stamps_ns[0]))
     finally:

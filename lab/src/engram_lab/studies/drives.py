@@ -44,6 +44,8 @@ class EvaluatedDrive:
         truth_hash: of its true poses, which stand beside it; None where there are none. Those of
             all drives of an evaluation are in one world frame.
         world: version of the simulated world that it was rendered in; None for other drives.
+        landmarks: of each frame, the first so many of those that the log keeps; None for the
+            front-end's own.
     """
 
     path: Path
@@ -54,6 +56,7 @@ class EvaluatedDrive:
     odometry: str
     truth_hash: str | None
     world: int | None = None
+    landmarks: int | None = None
 
     @property
     def name(self) -> str:
@@ -70,9 +73,13 @@ class EvaluatedDrive:
         """Whether its true poses are known."""
         return self.truth_hash is not None
 
+    def log(self) -> FrameLog:
+        """Its frame log, to be closed by the caller."""
+        return FrameLog(self.path, landmarks=self.landmarks)
+
     def frames(self) -> list[LoggedFrame]:
         """All its frames, in memory."""
-        log = FrameLog(self.path)
+        log = self.log()
         try:
             return list(log)
         finally:
