@@ -7,25 +7,45 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import settings as settings_of_tests
+from hypothesis import strategies as st
 from tests.builders import World, drive, map_simulated
 
-from engram.localiser.yardstick import Likeness, LookalikeConfig, Run
+from engram.frontend.frame import Landmarks
+from engram.localiser.yardstick import Likeness, LookalikeConfig, Run, unevenness
 from engram.maps.map import Map
 from engram.robot.front import Front
 from engram.robot.localisers import localiser_in
 from engram.robot.robot import Robot
 from engram.robot.settings import Settings
 
-STREET = World(90.0)
+
+class Sparse(World):
+    """A street of which a frame shows all that is in view."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.points = self.points[::4]
 
 
-class Copied(World):
-    """A street that shares some of the points of another one, and looks of them to the bit."""
+STREET = Sparse(90.0)
+_FRONT_M = 6.0
 
-    def __init__(self, of: World, share: float) -> None:
+
+class Copied(Sparse):
+    """A street that shares some of the points of another one, and looks of them to the bit.
+
+    It shares whole places, as equal fronts do, or here and there a point, as in rain.
+    """
+
+    def __init__(self, of: World, share: float, *, evenly: bool = False) -> None:
         super().__init__(of.length_m, seed=of.seed)
-        other = World(of.length_m, seed=of.seed + 100)
-        self._same = np.random.default_rng(3).random(len(self.points)) < share
+        other = Sparse(of.length_m, seed=of.seed + 100)
+        rng = np.random.default_rng(3)
+        place = np.unique(np.floor(self.points / _FRONT_M), axis=0, return_inverse=True)[1].ravel()
+        number = np.arange(len(self.points)) if evenly else place
+        self._same = rng.random(number.max() + 1)[number] < share
         self._other = other
         self.points = np.where(self._same[:, None], self.points, other.points)
 
@@ -66,10 +86,11 @@ def test_a_street_that_shares_a_quarter_of_what_is_seen_is_not_the_mapped_one(
 def test_the_street_itself_is_localised_from_the_first_frame_on(mapped: Path) -> None:
     assert fixes(mapped, STREET).mean() > 0.97
     assert fixes(mapped, Copied(STREET, 0.8)).mean() > 0.97  # some of it has changed
+    assert fixes(mapped, Copied(STREET, 0.35, evenly=True)).mean() > 0.97  # much, everywhere
 
 
-LOOKALIKE = Likeness(share=float(np.log(0.25)), more_bits=3.0, contradicted=0.2)
-USUAL = Likeness(share=float(np.log(0.7)), more_bits=3.0, contradicted=0.08)
+LOOKALIKE = Likeness(share=float(np.log(0.25)), more_bits=3.0, unevenness=4.0)
+USUAL = Likeness(share=float(np.log(0.7)), more_bits=3.0, unevenness=2.0)
 
 
 def after(*found: Likeness, step_m: float = 2.0) -> Run:
@@ -88,13 +109,45 @@ def test_one_lookalike_is_doubted_and_a_run_of_usual_matches_is_believed_again()
     assert not after(*[USUAL] * 3, *[LOOKALIKE] * 40).believed
 
 
-def test_few_inliers_that_differ_in_many_bits_or_that_odometry_lacks_too_are_no_lookalikes() -> (
-    None
-):
-    night = replace(LOOKALIKE, more_bits=34.0, contradicted=0.06)
-    rain = replace(LOOKALIKE, tracked=0.5)
+def test_few_inliers_that_differ_in_many_bits_or_lie_everywhere_are_no_lookalikes() -> None:
+    night = replace(LOOKALIKE, more_bits=34.0, unevenness=2.0)
+    rain = replace(LOOKALIKE, unevenness=1.3)
     assert after(*[night] * 20).proved
     assert after(*[rain] * 20).proved
+
+
+def landmarks(pixels: np.ndarray, depth_m: np.ndarray) -> Landmarks:
+    points = np.column_stack([0 * depth_m, 0 * depth_m, depth_m])
+    count = len(pixels)
+    return Landmarks(
+        pixels.astype(np.float32),
+        np.ones(count, np.float32),
+        np.ones(count, np.float32),
+        points.astype(np.float32),
+        np.zeros((count, 32), np.uint8),
+        np.zeros(count, np.uint8),
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 0.9))
+@settings_of_tests(max_examples=30, deadline=None)
+def test_unevenness_is_that_of_chance_where_every_place_loses_alike(
+    seed: int, share: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    count = 2000
+    seen = landmarks(rng.uniform(0, [512, 384], (count, 2)), rng.uniform(2, 60, count))
+    usual = np.arange(count, dtype=np.int32)
+    evenly = usual[rng.random(count) < share]
+    whole_places = usual[seen.pixels[:, 0] < 512 * share]
+    assert 0.3 < unevenness(seen, usual, evenly) < 2.0  # χ² of 50 over its degrees of freedom
+    assert unevenness(seen, usual, whole_places) > 5.0
+    assert unevenness(seen, usual, usual) < 2.0
+
+
+def test_unevenness_of_nothing_is_nothing() -> None:
+    none = np.zeros(0, np.int32)
+    assert unevenness(landmarks(np.zeros((0, 2)), np.zeros(0)), none, none) == 0.0
 
 
 def test_a_believed_run_is_looked_at_again_after_some_metres_only() -> None:
@@ -108,7 +161,7 @@ def test_a_robot_that_meets_a_node_where_it_was_saved_expects_no_more_than_usual
     tmp_path: Path,
 ) -> None:
     """A frame shares all its landmarks with the node that it was saved as."""
-    seen = drive(STREET, np.arange(0.0, 40.0, 1.2))
+    seen = drive(World(90.0), np.arange(0.0, 40.0, 1.2))
     path = tmp_path / "street.engram"
     map_simulated(path, seen)
     settings = Settings()

@@ -445,7 +445,6 @@ class Fixes:
         self.withdraws: tuple[int, ...] = ()
         self.lookalike: Outcome | None = None
         self._told = False
-        self._tracked = 0
 
     @property
     def on_trial(self) -> bool:
@@ -460,7 +459,6 @@ class Fixes:
 
     def begin_frame(self, tracked: int) -> None:
         """Begins a frame, with the landmarks that odometry tracked; nothing is withdrawn yet."""
-        self._tracked = tracked
         self._record.begin_frame(tracked)
         self.standing, self.withdraws = self._record.standing, ()
 
@@ -534,7 +532,7 @@ class Fixes:
         match = self._attempter.with_rows(live, live_id, outcome)
         if not len(match.live_rows):
             return None
-        return Likeness.of(match, reference, live, usual, self._tracked)
+        return Likeness.of(match, reference, live, usual)
 
     def fix(self, live: Frame, success: Outcome, result_sink: ResultSink) -> None:
         """Sets the position to that of a match, and checks it against earlier fixes.

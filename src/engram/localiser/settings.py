@@ -23,7 +23,7 @@ from engram.ranking.recent import RecentConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 21
+METHOD_VERSION = 22
 
 
 class NeighbourhoodSearch(StrEnum):

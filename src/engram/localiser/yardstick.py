@@ -5,18 +5,16 @@ with itself, frame after frame. A robot that has only met such matches finds the
 of them agrees. So the yardstick is the map's: what a node has in common with the node before it,
 which the same drive saved a metre back in the same light.
 
-Light, rain and years leave fewer inliers, too, but they change descriptors: the inliers themselves
-differ in more bits. Copies of a front look alike to the bit, and what stands around them has no
-match. And where landmarks of node and live frame lie in one direction at different depths, one of
-the two sees through something that should be there.
+Light, rain and years leave fewer inliers, too, but they take landmarks here and there, and change
+descriptors. Copies of a front look alike to the bit, and what stands around them has no match:
+landmarks are missing in whole places.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -24,43 +22,30 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from engram.config import check_bounds
-from engram.frontend.frame import BRIEF, DescriptorKind, Frame
+from engram.frontend.frame import BRIEF, DescriptorKind, Frame, Landmarks
 from engram.frontend.matching import Match, MatcherConfig, match_frames, pair_seed
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, NodeId
 
-# ln(inliers / usual inliers) of right matches, by how many bits more than usual they differ in.
-# Source: `hamlet` in all pairs of its dry drives.
-_MORE_BITS = (0.0, 7.0, 12.0, 17.0, 22.0, 27.0, 32.0, 42.0)
-_RIGHT = (-0.42, -0.52, -0.61, -0.90, -1.21, -1.35, -1.46, -1.66)
-# From so many more bits on, and from so few tracked landmarks down, less and less is judged.
-_JUDGED_BITS, _NOT_JUDGED_BITS = 13.9, 20.4
-_JUDGED_TRACKED, _NOT_JUDGED_TRACKED = 0.8, 0.6
-# Log-odds of a look-alike by what is missing of that logarithm, and by contradicted landmarks, each
-# beyond what right matches often have; of one match at most. Source: rings between equal fronts of
-# 20, 30 and 37.5 m against the same drives.
-_OF_SHARE, _OFTEN_MISSING = 2.93, 0.37
-_OF_DEPTHS, _OFTEN_CONTRADICTED = 7.0, 0.11
+# Log-odds that a match is a look-alike: constant, and weights of ln(inliers / usual inliers), of
+# `more_bits` and of ln(`unevenness`); of one match at most. Source: `lab/reports/lookalikes.md`.
+_ALIKE, _OF_SHARE, _OF_BITS, _OF_UNEVENNESS = -7.0, -4.5, -0.1, 3.8
 _MOST = 3.0
-# What a run had before is forgotten by this share over `apart_m` that nothing can be judged.
-_FORGOTTEN = 0.3
 # A chain has a node each metre or so; a node farther away shows other things.
 _NEIGHBOUR_M = 4.0
-# Landmarks within this many pixels lie in one direction; those nearer than this have a depth.
-_DIRECTION_PX = 4
-_NEAR_M = 25.0
-_LEAST_DEPTH_M = 1.5
-# Directions that count as agreeing without being seen, so that few of them say little.
-_UNSEEN = 20.0
-# Newest matches that tell how the light has changed since a map was made.
-_LIGHT_OF = 40
+# Places are parts of the image's width, and of the distance up to the farthest in equal ratios.
+_COLUMNS, _DEPTHS, _FARTHEST_M = 8, 8, 64.0
+# Nearer or farther than by this factor a landmark looks different.
+_SAME_SIZE = 1.5
+# Less says no more: of few landmarks chance makes it small.
+_LEAST_UNEVENNESS = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class LookalikeConfig:
     """How runs of matches are distinguished from runs of look-alikes.
 
-    Source: ``python -m engram_lab.checks.equal_fronts``.
+    Source: `lab/reports/lookalikes.md`.
     """
 
     doubt: Annotated[
@@ -100,16 +85,18 @@ class LookalikeConfig:
         check_bounds(self)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Usual:
     """What a node has in common with its neighbour in the same drive.
 
     Attributes:
         bits: median number of bits in which descriptors of the inliers differ.
+        rows: (inliers,) int32, rows of the node's landmarks that agree.
     """
 
     inliers: int
     bits: float
+    rows: NDArray[np.int32]
 
 
 class Yardstick:
@@ -148,7 +135,7 @@ class Yardstick:
         match = match_frames(ours, theirs, self._config, pair_seed(node, neighbour))
         if match.reference_from_live is None:
             return None
-        return Usual(match.inliers, median_bits(match, ours, theirs))
+        return Usual(match.inliers, median_bits(match, ours, theirs), match.reference_rows)
 
     def _neighbour(self, index: int) -> NodeId | None:
         """The node before it in its drive; the next one if there is none.
@@ -175,62 +162,43 @@ def median_bits(match: Match, reference: Frame, live: Frame) -> float:
     return float(np.median(np.unpackbits(ours ^ theirs, axis=1).sum(axis=1)))
 
 
-def contradicted(match: Match, reference: Frame, live: Frame) -> float:
-    """Share of the near landmarks without a match that lie behind or before another one's.
+def unevenness(landmarks: Landmarks, usual: NDArray[np.int32], found: NDArray[np.int32]) -> float:
+    """How far what a match found of the usual landmarks depends on the place.
 
-    A landmark of the node is seen in the live camera as the match says. Where a live landmark lies
-    in the same direction, but at another depth, something has come or gone.
+    Places are columns of the image at one distance. The likelihood ratio of a rate each against one
+    rate for all (the G statistic), over its degrees of freedom: about 1 where chance alone decides.
 
     Args:
-        reference: the node's frame.
-        live: the live frame.
+        landmarks: those of the node.
+        usual: (U,) int32, rows that usually match.
+        found: (F,) int32, rows that match.
     """
+    u, depth_m = landmarks.pixels[usual, 0], landmarks.points_in_cam[usual, 2]
+    width = float(landmarks.pixels[:, 0].max(initial=0.0)) + 1.0
+    column = (u * _COLUMNS / width).astype(np.int64)
+    distance = np.log(np.maximum(depth_m, 1.0)) * _DEPTHS / math.log(_FARTHEST_M)
+    place = np.clip(distance.astype(np.int64), 0, _DEPTHS - 1) * _COLUMNS + column
+    hits = np.isin(usual, found)
+    there = np.bincount(place, minlength=_COLUMNS * _DEPTHS)
+    hit = np.bincount(place, weights=hits, minlength=_COLUMNS * _DEPTHS)[there > 0]
+    there = there[there > 0]
+    rate = float(np.clip(hits.mean(), 0.02, 0.98)) if len(hits) else 0.5
+    rates = np.clip(hit / there, 1e-9, 1 - 1e-9)
+    gained = hit * np.log(rates / rate) + (there - hit) * np.log((1 - rates) / (1 - rate))
+    return float(2 * gained.sum() / max(len(there) - 1, 1))
+
+
+def _in_view(match: Match, reference: Frame, live: Frame, usual: Usual) -> NDArray[np.int32]:
+    """Rows of the usual landmarks that a match has in the live image, about as large as there."""
     assert match.reference_from_live is not None
-    camera = live.camera
-    live_rows = np.ones(len(live.landmarks), np.bool_)
-    live_rows[match.live_rows] = False
-    rows = np.ones(len(reference.landmarks), np.bool_)
-    rows[match.reference_rows] = False
-    points = match.reference_from_live.inverse() @ reference.landmarks.points_in_cam[rows].astype(
-        np.float64
-    )
-    points = points[points[:, 2] > _LEAST_DEPTH_M]
-    u = camera.fx * points[:, 0] / points[:, 2] + camera.cx
-    v = camera.fy * points[:, 1] / points[:, 2] + camera.cy
+    live_from_reference = match.reference_from_live.inverse()
+    there = reference.landmarks.points_in_cam[usual.rows].astype(np.float64)
+    points, camera = live_from_reference @ there, live.camera
+    scale = there[:, 2] / np.maximum(points[:, 2], 0.1)
+    u = camera.fx * points[:, 0] / np.maximum(points[:, 2], 0.1) + camera.cx
+    v = camera.fy * points[:, 1] / np.maximum(points[:, 2], 0.1) + camera.cy
     seen = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    expected_px = camera.focal_baseline / points[seen, 2]
-    found_px = _disparity_at(
-        np.column_stack([u[seen], v[seen]]),
-        live.landmarks.pixels[live_rows],
-        live.landmarks.disparity_px[live_rows],
-        (camera.width, camera.height),
-    )
-    greater_px = np.fmax(expected_px, found_px)
-    counts = greater_px > camera.focal_baseline / _NEAR_M  # not where there is none: NaN
-    apart = np.abs(expected_px - found_px) > 1.0 + 0.1 * greater_px
-    counts &= np.isfinite(found_px)
-    return float((apart & counts).sum() + _OFTEN_CONTRADICTED * _UNSEEN) / float(
-        counts.sum() + _UNSEEN
-    )
-
-
-def _disparity_at(
-    pixels: NDArray[np.floating],
-    landmarks: NDArray[np.floating],
-    disparity_px: NDArray[np.floating],
-    size: tuple[int, int],
-) -> NDArray[np.float64]:
-    """(N,) disparity of a landmark near each of (N, 2) pixels, NaN where there is none."""
-    width, height = (extent // _DIRECTION_PX + 3 for extent in size)
-    raster = np.full((height, width), np.nan)
-    column, row = (landmarks // _DIRECTION_PX).astype(np.int64).T + 1
-    raster[row, column] = disparity_px
-    column, row = (pixels // _DIRECTION_PX).astype(np.int64).T + 1
-    near = np.stack([raster[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
-    near = near[[4, 1, 3, 5, 7, 0, 2, 6, 8]]  # its own cell first, then those beside it
-    first = np.isfinite(near).argmax(axis=0)
-    found: NDArray[np.float64] = near[first, np.arange(near.shape[1])]
-    return found
+    return usual.rows[seen & (scale < _SAME_SIZE) & (scale > 1 / _SAME_SIZE)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,36 +208,27 @@ class Likeness:
     Attributes:
         share: natural logarithm of its inliers over the usual ones.
         more_bits: how many bits more than usual its inliers differ in.
-        contradicted: see `contradicted`.
-        tracked: landmarks that odometry tracked over the usual inliers, 1 at most or if unknown.
+        unevenness: see `unevenness`.
     """
 
     share: float
     more_bits: float
-    contradicted: float
-    tracked: float = 1.0
+    unevenness: float
 
     @staticmethod
-    def of(match: Match, reference: Frame, live: Frame, usual: Usual, tracked: int) -> Likeness:
-        """That of a match, in whose live frame odometry tracked so many landmarks; 0: unknown."""
+    def of(match: Match, reference: Frame, live: Frame, usual: Usual) -> Likeness:
+        """That of a match with a node; usual is what usually matches of what is in view."""
+        rows = _in_view(match, reference, live, usual)
         return Likeness(
-            math.log(match.inliers / max(usual.inliers, 1)),
+            math.log(match.inliers / max(len(rows), 1)),
             median_bits(match, reference, live) - usual.bits,
-            contradicted(match, reference, live),
-            min(tracked / max(usual.inliers, 1), 1.0) if tracked else 1.0,
+            unevenness(reference.landmarks, rows, match.reference_rows),
         )
 
-    def judged(self) -> float:
-        """How far it can be judged in its light, 0 to 1."""
-        light = (_NOT_JUDGED_BITS - self.more_bits) / (_NOT_JUDGED_BITS - _JUDGED_BITS)
-        seen = (self.tracked - _NOT_JUDGED_TRACKED) / (_JUDGED_TRACKED - _NOT_JUDGED_TRACKED)
-        return min(max(light, 0.0), 1.0) * min(max(seen, 0.0), 1.0)
-
     def alike(self) -> float:
-        """Log-odds that it is a look-alike, if it can be judged."""
-        missing = float(np.interp(self.more_bits, _MORE_BITS, _RIGHT)) - self.share
-        alike = _OF_SHARE * (missing - _OFTEN_MISSING)
-        alike += _OF_DEPTHS * (self.contradicted - _OFTEN_CONTRADICTED)
+        """Log-odds that it is a look-alike."""
+        alike = _ALIKE + _OF_SHARE * self.share + _OF_BITS * self.more_bits
+        alike += _OF_UNEVENNESS * math.log(max(self.unevenness, _LEAST_UNEVENNESS))
         return min(max(alike, -_MOST), _MOST)
 
 
@@ -283,8 +242,6 @@ class Run:
 
     def __init__(self, config: LookalikeConfig) -> None:
         self._config = config
-        self._more_bits: deque[float] = deque(maxlen=_LIGHT_OF)
-        self._tracked: deque[float] = deque(maxlen=_LIGHT_OF)
         self._alike = 0.0
         self._at_m: float | None = None
         self.believed = self.proved = True
@@ -306,24 +263,15 @@ class Run:
     def add(self, found: Likeness, driven_m: float) -> None:
         """Adds what a match shows after so many metres."""
         config, first = self._config, self._at_m is None
-        self._more_bits.append(found.more_bits)
-        self._tracked.append(found.tracked)
-        found = replace(
-            found,
-            more_bits=float(np.median(self._more_bits)),
-            tracked=float(np.median(self._tracked)),
-        )
         step_m = config.apart_m if self._at_m is None else driven_m - self._at_m
-        weight, judged = min(step_m / config.apart_m, 1.0), found.judged()
-        total = self._alike + judged * weight * found.alike()
-        total *= 1.0 - _FORGOTTEN * (1.0 - judged) * weight
+        total = self._alike + min(step_m / config.apart_m, 1.0) * found.alike()
         self._alike = min(max(total, -config.most), config.most)
         self._at_m = driven_m
+        usual = self._alike <= -config.proof
         if self.believed:
             self.believed = self._alike <= (config.doubt_first if first else config.doubt)
         else:
-            self.believed = self._alike <= -config.proof * judged
-        usual = self._alike <= -config.proof * judged
+            self.believed = usual
         self.proved = self.believed and (usual or (self.proved and not first))
 
 

@@ -58,7 +58,7 @@ class LoopConfig:
         certain_m: largest standard deviation of the path between two matches that confirm each
             other, metres.
         proof: mean log-odds that two matches are no look-alikes, from which they confirm each
-            other. Source: ``python -m engram_lab.checks.equal_fronts``.
+            other. Source: `lab/reports/lookalikes.md`.
     """
 
     attempts: int = 8
@@ -194,9 +194,8 @@ class LoopSearch:
         known = self._attempter.frame(found.edge.a)
         if usual is None or known is None or not is_measured(known.descriptor):
             return found
-        likeness = Likeness.of(found.match, known, found.frame, usual, 0)
-        judged = likeness.judged()
-        return replace(found, alike=judged * (likeness.alike() + self.config.proof))
+        likeness = Likeness.of(found.match, known, found.frame, usual)
+        return replace(found, alike=likeness.alike() + self.config.proof)
 
     def _confirmed(self, match: _Match) -> list[_Match]:
         """The match and the waiting ones that agree with it; none if it must wait itself."""

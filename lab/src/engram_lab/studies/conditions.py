@@ -86,7 +86,7 @@ class Row:
     Attributes:
         right, false, off: shares of the frames that are localised; false by more than 1 m or 5°,
             off by more than 0.5 m.
-        gap_m: longest way without a right fix, metres.
+        gap_m: longest distance without a right fix, metres.
         cpu_ms: processor time of a step, ms.
     """
 
@@ -149,7 +149,7 @@ def row_of(condition: str, street: Street) -> Row:
 
 
 def longest_gap_m(world_from_cam: Sequence[SE3], localised: Sequence[int]) -> float:
-    """Longest way between localised frames, from the start and to the end too, metres."""
+    """Longest distance between localised frames, from the start and to the end too, metres."""
     at_m = np.array([pose.translation for pose in world_from_cam])
     driven_m = np.concatenate([[0.0], np.linalg.norm(np.diff(at_m, axis=0), axis=1).cumsum()])
     stops = [0.0, *driven_m[list(localised)].tolist(), float(driven_m[-1])]
