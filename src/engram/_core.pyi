@@ -350,6 +350,8 @@ class OdometrySettings:
     window_landmarks: int
     window_iterations: int
     window_offset_sigma_px: float
+    window_pixel_sigma_px: float
+    window_disparity_sigma_px: float
     min_inliers: int
     unexpected_inliers: int
     plausible_inliers: int
@@ -358,6 +360,9 @@ class OdometrySettings:
     acceleration_m_s2: float
     angular_acceleration_rad_s2: float
     max_prediction_s: float
+    steady_m: float
+    steady_rad: float
+    steady_share: float
     keyframe_flow_px: float
     keyframe_share: float
 

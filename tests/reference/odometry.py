@@ -20,6 +20,8 @@ _S_PER_NS = 1e-9
 _USUAL_OF = 20
 # Frames are missing if one comes later than this many usual intervals after the last.
 _GAP_RATIO = 1.5
+# A motion nearer than this to the last speed goes on as before.
+_STEADY_SIGMAS = 2.0
 _UNSEEN = -1
 
 
@@ -118,19 +120,9 @@ class Window:
         carry = keyframe_from_world.adjoint()
         keyframe_from_newest = keyframe_from_world @ moved[-1].world_from_cam
         by_residuals = carry @ _covariance_of_last_step(covariance) @ carry.T
-        moved_m = keyframe_from_newest.distance_m
         wider = 1 + match.inliers / self._matcher.independent_landmarks
-        doubted = self._doubted(by_residuals, match.inliers, moved_m)
-        return keyframe_from_newest, doubted, wider * by_residuals
-
-    def _doubted(
-        self, covariance: NDArray[np.float64], inliers: int, moved_m: float
-    ) -> NDArray[np.float64]:
-        matcher = self._matcher
-        shift = (matcher.displaced_m / inliers) ** 2 + matcher.calibration_m**2
-        shift += (matcher.calibration_share * moved_m) ** 2
-        unseen = np.diag([shift] * 3 + [matcher.calibration_rad**2] * 3)
-        return (1 + (self._few_inliers / inliers) ** 2) * covariance + unseen
+        growth = 1 + (self._few_inliers / match.inliers) ** 2
+        return keyframe_from_newest, growth * by_residuals, wider * by_residuals
 
     def _place(self, frame: Frame, world_from_cam: SE3) -> _Placed:
         marks = frame.landmarks
@@ -140,9 +132,9 @@ class Window:
             world_from_cam,
             tracks=np.full(len(marks), _UNSEEN, dtype=np.int32),
             stereo=np.column_stack([marks.pixels, marks.disparity_px]),
-            pixel_sigma_px=(self._matcher.pixel_sigma_px * growth).astype(np.float32),
+            pixel_sigma_px=(self._config.pixel_sigma_px * growth).astype(np.float32),
             disparity_sigma_px=np.hypot(
-                marks.disparity_sigma_px, np.float32(self._matcher.disparity_sigma_px)
+                marks.disparity_sigma_px, np.float32(self._config.disparity_sigma_px)
             ),
         )
 
@@ -324,10 +316,12 @@ class _Track:
         prev_from_keyframe = self._keyframe_from_prev.inverse()
         prev_from_curr = prev_from_keyframe @ keyframe_from_curr
         carry = prev_from_keyframe.adjoint()
+        left_m = self._config.matcher.calibration_share * prev_from_curr.distance_m
         step = OdometryStep(
             OdometryStatus.OK,
             prev_from_curr,
-            carry @ (self._covariance + covariance) @ carry.T,
+            carry @ (self._covariance + covariance) @ carry.T
+            + np.diag([left_m**2] * 3 + [0.0] * 3),
             match.inliers,
         )
         interval_s = (frame.stamp_ns - self.stamp_ns) * _S_PER_NS
@@ -346,6 +340,7 @@ class _Track:
         prediction = self._predict(frame, expected)
         if prediction is not None:
             match = match_frames(key, frame, matcher, seed, *prediction)
+            match = self._or_steady(frame, match)
             if match.inliers >= self._config.min_inliers:
                 return match
         return match_frames(key, frame, matcher, seed)
@@ -354,22 +349,46 @@ class _Track:
         self, frame: Frame, expected: Guess | None
     ) -> tuple[SE3, NDArray[np.float64]] | None:
         interval_s = (frame.stamp_ns - self.stamp_ns) * _S_PER_NS
-        if self._velocity is None or not 0 < interval_s <= self._config.max_prediction_s:
+        if not self._knows_speed(interval_s):
             if expected is None or not expected.has_way:
                 return None
             return (
                 self._keyframe_from_prev @ expected.prev_from_curr,
                 propagate_covariance(self._keyframe_from_prev, self._searched, expected.covariance),
             )
-        prev_from_curr = SE3.exp(self._velocity * interval_s)
-        sigma = np.repeat(
-            [self._config.acceleration_m_s2, self._config.angular_acceleration_rad_s2], 3
+        square = interval_s**2
+        return self._by_speed(
+            interval_s,
+            self._config.acceleration_m_s2 * square,
+            self._config.angular_acceleration_rad_s2 * square,
         )
-        noise = np.diag((sigma * interval_s**2) ** 2)
+
+    def _knows_speed(self, interval_s: float) -> bool:
+        return self._velocity is not None and 0 < interval_s <= self._config.max_prediction_s
+
+    def _by_speed(
+        self, interval_s: float, sigma_m: float, sigma_rad: float
+    ) -> tuple[SE3, NDArray[np.float64]]:
+        assert self._velocity is not None
+        noise = np.diag(np.repeat([sigma_m, sigma_rad], 3) ** 2)
         return (
-            self._keyframe_from_prev @ prev_from_curr,
+            self._keyframe_from_prev @ SE3.exp(self._velocity * interval_s),
             propagate_covariance(self._keyframe_from_prev, self._searched, noise),
         )
+
+    def _or_steady(self, frame: Frame, match: Match) -> Match:
+        """A match, or that at the last speed where enough landmarks agree on it, too."""
+        config, interval_s = self._config, (frame.stamp_ns - self.stamp_ns) * _S_PER_NS
+        if match.reference_from_live is None or not self._knows_speed(interval_s):
+            return match
+        steady = self._by_speed(interval_s, config.steady_m, config.steady_rad)
+        away = _sigmas_away(steady, match)
+        if away <= _STEADY_SIGMAS:
+            return match
+        seed = frame.stamp_ns % 2**64
+        again = match_frames(self._window.keyframe, frame, config.matcher, seed, *steady)
+        enough = again.inliers >= max(config.steady_share * match.inliers, config.min_inliers)
+        return again if enough and _sigmas_away(steady, again) < away else match
 
     def _keep_previous_as_keyframe(self) -> None:
         self._window.keep_newest()
@@ -382,6 +401,13 @@ class _Track:
             return True
         flow = frame.landmarks.pixels[match.live_rows] - before.pixels[match.reference_rows]
         return bool(np.median(np.abs(flow).max(axis=1)) > self._config.keyframe_flow_px)
+
+
+def _sigmas_away(prediction: tuple[SE3, NDArray[np.float64]], match: Match) -> float:
+    predicted, covariance = prediction
+    assert match.reference_from_live is not None
+    off = (match.reference_from_live @ predicted.inverse()).log()
+    return float((np.abs(off) / np.sqrt(np.diag(covariance))).max())
 
 
 def _reason(match: Match) -> OdometryStatus:

@@ -18,9 +18,10 @@ struct Odometry {
 
   explicit Odometry(const OdometrySettings &settings) : settings(settings) {
     if (settings.window_frames < 2 || settings.window_landmarks < 1 ||
-        settings.window_iterations < 0 || !(settings.window_offset_sigma_px > 0))
+        settings.window_iterations < 0 || !(settings.window_offset_sigma_px > 0) ||
+        !(settings.window_pixel_sigma_px > 0) || !(settings.window_disparity_sigma_px > 0))
       throw nb::value_error("odometry: a window of at least two frames and one landmark is needed, "
-                            "and offset_sigma_px > 0");
+                            "and offset_sigma_px, pixel_sigma_px and disparity_sigma_px > 0");
     // An estimate from fewer has no median and no covariance.
     if (settings.min_inliers < 1)
       throw nb::value_error("odometry: min_inliers must be at least 1");
@@ -80,6 +81,8 @@ void bind_odometry(nb::module_ &module) {
       .def_rw("window_landmarks", &OdometrySettings::window_landmarks)
       .def_rw("window_iterations", &OdometrySettings::window_iterations)
       .def_rw("window_offset_sigma_px", &OdometrySettings::window_offset_sigma_px)
+      .def_rw("window_pixel_sigma_px", &OdometrySettings::window_pixel_sigma_px)
+      .def_rw("window_disparity_sigma_px", &OdometrySettings::window_disparity_sigma_px)
       .def_rw("min_inliers", &OdometrySettings::min_inliers)
       .def_rw("unexpected_inliers", &OdometrySettings::unexpected_inliers)
       .def_rw("plausible_inliers", &OdometrySettings::plausible_inliers)
@@ -88,6 +91,9 @@ void bind_odometry(nb::module_ &module) {
       .def_rw("acceleration_m_s2", &OdometrySettings::acceleration_m_s2)
       .def_rw("angular_acceleration_rad_s2", &OdometrySettings::angular_acceleration_rad_s2)
       .def_rw("max_prediction_s", &OdometrySettings::max_prediction_s)
+      .def_rw("steady_m", &OdometrySettings::steady_m)
+      .def_rw("steady_rad", &OdometrySettings::steady_rad)
+      .def_rw("steady_share", &OdometrySettings::steady_share)
       .def_rw("keyframe_flow_px", &OdometrySettings::keyframe_flow_px)
       .def_rw("keyframe_share", &OdometrySettings::keyframe_share);
   nb::class_<Odometry>(module, "Odometry", "Visual odometry of one camera, frame by frame.")

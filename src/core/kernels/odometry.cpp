@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "kernels/doubt.hpp"
 #include "kernels/pose.hpp"
 #include "kernels/tracked_window.hpp"
 #include "kernels/twist.hpp"
@@ -19,6 +20,8 @@ constexpr double kSecondsPerNs = 1e-9;
 constexpr size_t kUsualOf = 20;
 // Frames are missing if one comes later than this many usual intervals after the last.
 constexpr double kGapRatio = 1.5;
+// A motion nearer than this to the last speed goes on as before.
+constexpr double kSteadySigmas = 2;
 
 void remember(std::vector<double> &values, double value) {
   if (values.size() == kUsualOf)
@@ -43,28 +46,37 @@ double seconds_since(const OdometryTrack &track, int64_t stamp_ns) {
   return static_cast<double>(stamp_ns - track.stamp_ns) * kSecondsPerNs;
 }
 
-// By constant velocity, or what is expected where that says nothing.
-std::optional<Prediction> predict(const OdometryTrack &track, const OdometrySettings &settings,
-                                  double interval_s, const ExpectedMotion *expected) {
+bool knows_speed(const OdometryTrack &track, const OdometrySettings &settings, double interval_s) {
+  return track.velocity && interval_s > 0 && interval_s <= settings.max_prediction_s;
+}
+
+// By constant velocity, give or take so much.
+Prediction by_speed(const OdometryTrack &track, double interval_s, double sigma_m,
+                    double sigma_rad) {
   const RigidTransform &keyframe_from_prev = track.keyframe_from_prev;
-  if (!track.velocity || !(interval_s > 0 && interval_s <= settings.max_prediction_s)) {
-    if (expected == nullptr)
-      return std::nullopt;
-    return Prediction{compose(keyframe_from_prev, expected->prev_from_curr),
-                      track.searched + carried(keyframe_from_prev, expected->covariance)};
-  }
   Tangent moved = *track.velocity;
   for (double &entry : moved)
     entry *= interval_s;
   Covariance noise{};
-  for (int i = 0; i < 6; ++i) {
-    const double sigma = (i < 3 ? settings.acceleration_m_s2
-                                : settings.angular_acceleration_rad_s2) *
-                         (interval_s * interval_s);
-    noise[7 * i] = sigma * sigma;
+  for (int i = 0; i < 6; ++i)
+    noise[7 * i] = squared(i < 3 ? sigma_m : sigma_rad);
+  return {compose(keyframe_from_prev, exponential(moved)),
+          track.searched + carried(keyframe_from_prev, noise)};
+}
+
+// By constant velocity, or what is expected where that says nothing.
+std::optional<Prediction> predict(const OdometryTrack &track, const OdometrySettings &settings,
+                                  double interval_s, const ExpectedMotion *expected) {
+  if (knows_speed(track, settings, interval_s)) {
+    const double square = interval_s * interval_s;
+    return by_speed(track, interval_s, settings.acceleration_m_s2 * square,
+                    settings.angular_acceleration_rad_s2 * square);
   }
-  return Prediction{compose(keyframe_from_prev, exponential(moved)),
-                    track.searched + carried(keyframe_from_prev, noise)};
+  if (expected == nullptr)
+    return std::nullopt;
+  const RigidTransform &keyframe_from_prev = track.keyframe_from_prev;
+  return Prediction{compose(keyframe_from_prev, expected->prev_from_curr),
+                    track.searched + carried(keyframe_from_prev, expected->covariance)};
 }
 
 // The matcher refines in single precision: many small updates skew the rotation by 1e-6.
@@ -75,6 +87,15 @@ PoseEstimate attempted(const KeptFrame &key, const FrameView &live, const MatchS
   if (found.found)
     found.reference_from_live = renormalised(found.reference_from_live);
   return found;
+}
+
+// How far a pose is from a prediction, in standard deviations of its least likely component.
+double sigmas_away(const Prediction &prediction, const RigidTransform &pose) {
+  const Tangent off = logarithm(compose(pose, inverse(prediction.reference_from_live)));
+  double most = 0;
+  for (int i = 0; i < 6; ++i)
+    most = std::max(most, std::abs(off[i]) / std::sqrt(prediction.covariance[7 * i]));
+  return most;
 }
 
 int32_t inliers_of(const PoseEstimate &match) {
@@ -128,11 +149,28 @@ private:
   PoseEstimate matched_to_keyframe() const {
     const KeptFrame &key = keyframe_of(track_.window);
     if (const auto prediction = predict(track_, settings_, interval_s_, expected_)) {
-      PoseEstimate match = attempted(key, live_, settings_.match, stamp_ns_, &*prediction);
+      PoseEstimate match =
+          or_steady(key, attempted(key, live_, settings_.match, stamp_ns_, &*prediction));
       if (inliers_of(match) >= settings_.min_inliers)
         return match;
     }
     return attempted(key, live_, settings_.match, stamp_ns_, nullptr);
+  }
+
+  // A match, or that at the last speed where enough landmarks agree on it, too: drops on the lens
+  // and the light of one's own lamps move along with the camera, and agree that nothing moves.
+  PoseEstimate or_steady(const KeptFrame &key, PoseEstimate match) const {
+    if (!match.found || !knows_speed(track_, settings_, interval_s_))
+      return match;
+    const Prediction steady =
+        by_speed(track_, interval_s_, settings_.steady_m, settings_.steady_rad);
+    const double away = sigmas_away(steady, match.reference_from_live);
+    if (away <= kSteadySigmas)
+      return match;
+    PoseEstimate again = attempted(key, live_, settings_.match, stamp_ns_, &steady);
+    const bool enough = inliers_of(again) >= settings_.min_inliers &&
+                        inliers_of(again) >= settings_.steady_share * inliers_of(match);
+    return enough && sigmas_away(steady, again.reference_from_live) < away ? again : match;
   }
 
   // Whether enough landmarks agree on the motion; after a gap in time more are needed.
@@ -174,6 +212,10 @@ private:
     motion.prev_from_curr = compose(prev_from_keyframe, keyframe_from_curr.pose);
     motion.covariance =
         carried(prev_from_keyframe, track_.covariance + keyframe_from_curr.covariance);
+    // What calibration leaves is a share of the motion: one camera took both frames.
+    const double left_m = settings_.match.calibration_share * norm(motion.prev_from_curr.translation);
+    for (int axis = 0; axis < 3; ++axis)
+      motion.covariance[7 * axis] += squared(left_m);
     motion.inliers = inliers_of(match);
     track_.velocity.reset();
     if (interval_s_ > 0) {

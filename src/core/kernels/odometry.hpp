@@ -14,11 +14,12 @@ namespace engram {
 struct OdometrySettings {
   MatchSettings match;
   int32_t window_frames = 0, window_landmarks = 0, window_iterations = 0;
-  double window_offset_sigma_px = 0;
+  double window_offset_sigma_px = 0, window_pixel_sigma_px = 0, window_disparity_sigma_px = 0;
   int32_t min_inliers = 0, unexpected_inliers = 0, plausible_inliers = 0;
   double usual_share = 0, few_inliers = 0;
   double acceleration_m_s2 = 0, angular_acceleration_rad_s2 = 0;
   double max_prediction_s = 0;
+  double steady_m = 0, steady_rad = 0, steady_share = 0;
   double keyframe_flow_px = 0, keyframe_share = 0;
 };
 
@@ -31,7 +32,7 @@ struct KeptFrame {
   std::vector<uint8_t> octaves;
   RigidTransform world_from_cam;
   std::vector<int32_t> tracks; // of each landmark; −1 if no other frame shares it
-  std::vector<float> view_pixel_sigma_px, view_disparity_sigma_px; // between views
+  std::vector<float> window_pixel_sigma_px, window_disparity_sigma_px; // in the window
 
   FrameView view() const {
     return {static_cast<int64_t>(octaves.size()), width,

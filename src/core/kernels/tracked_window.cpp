@@ -18,7 +18,7 @@ template <class T> void copy(const T *from, int64_t count, std::vector<T> &to) {
 }
 
 KeptFrame kept(const FrameView &frame, const RigidTransform &world_from_cam,
-               const MatchSettings &match) {
+               const OdometrySettings &settings) {
   KeptFrame copied;
   copied.width = frame.width;
   copied.camera = frame.camera;
@@ -30,20 +30,20 @@ KeptFrame kept(const FrameView &frame, const RigidTransform &world_from_cam,
   copy(frame.descriptors, frame.width * frame.count, copied.descriptors);
   copy(frame.octaves, frame.count, copied.octaves);
   copied.tracks.assign(static_cast<size_t>(frame.count), kUnseen);
-  copied.view_pixel_sigma_px.resize(static_cast<size_t>(frame.count));
-  copied.view_disparity_sigma_px.resize(static_cast<size_t>(frame.count));
+  copied.window_pixel_sigma_px.resize(static_cast<size_t>(frame.count));
+  copied.window_disparity_sigma_px.resize(static_cast<size_t>(frame.count));
   // By octave: a corner's error grows with the square root of the octave's scale.
   std::array<float, 256> pixel_sigma_px;
   double growth = 1;
   for (float &sigma_px : pixel_sigma_px) {
-    sigma_px = static_cast<float>(match.pixel_sigma_px * growth);
-    growth *= std::sqrt(match.octave_scale);
+    sigma_px = static_cast<float>(settings.window_pixel_sigma_px * growth);
+    growth *= std::sqrt(settings.match.octave_scale);
   }
-  const double more = static_cast<float>(match.disparity_sigma_px);
+  const double more = static_cast<float>(settings.window_disparity_sigma_px);
   for (int64_t i = 0; i < frame.count; ++i) {
     const double own = frame.disparity_sigma_px[i];
-    copied.view_pixel_sigma_px[i] = pixel_sigma_px[frame.octaves[i]];
-    copied.view_disparity_sigma_px[i] = static_cast<float>(std::sqrt(own * own + more * more));
+    copied.window_pixel_sigma_px[i] = pixel_sigma_px[frame.octaves[i]];
+    copied.window_disparity_sigma_px[i] = static_cast<float>(std::sqrt(own * own + more * more));
   }
   return copied;
 }
@@ -120,8 +120,8 @@ struct Gathered {
         stereo[3 * k] = from.pixels[2 * row];
         stereo[3 * k + 1] = from.pixels[2 * row + 1];
         stereo[3 * k + 2] = from.disparity_px[row];
-        pixel_sigma_px[k] = from.view_pixel_sigma_px[row];
-        disparity_sigma_px[k] = from.view_disparity_sigma_px[row];
+        pixel_sigma_px[k] = from.window_pixel_sigma_px[row];
+        disparity_sigma_px[k] = from.window_disparity_sigma_px[row];
         ++k;
       }
     }
@@ -162,7 +162,7 @@ std::array<double, 36> covariance_of_last_step(const WindowResult &adjusted, siz
 OdometryWindow begin_window(const FrameView &first, const OdometrySettings &settings,
                             double offset_px) {
   OdometryWindow window;
-  window.keyframes.push_back(kept(first, RigidTransform{}, settings.match));
+  window.keyframes.push_back(kept(first, RigidTransform{}, settings));
   window.offset_px = offset_px;
   return window;
 }
@@ -171,7 +171,7 @@ void add_to_window(OdometryWindow &window, const FrameView &frame, const PoseEst
                    const OdometrySettings &settings) {
   KeptFrame &key = window.keyframes.back();
   window.newest =
-      kept(frame, compose(key.world_from_cam, match.reference_from_live), settings.match);
+      kept(frame, compose(key.world_from_cam, match.reference_from_live), settings);
   for (const RowPair &pair : match.inliers) {
     int32_t &track = key.tracks[pair.reference];
     if (track == kUnseen)
@@ -218,9 +218,9 @@ PlacedPose optimise_window(OdometryWindow &window, const PoseEstimate &match,
                     {}};
   const auto inliers = static_cast<double>(match.inliers.size());
   placed.searched = searched(placed.covariance, inliers, settings.match);
-  placed.covariance =
-      doubted(placed.covariance, growth_of_few(settings.few_inliers, inliers), inliers,
-              placed.pose.translation, settings.match);
+  const double growth = growth_of_few(settings.few_inliers, inliers);
+  for (double &entry : placed.covariance)
+    entry *= growth;
   return placed;
 }
 

@@ -386,6 +386,14 @@ class GapConfig:
             "to 8, a drone turns back with 10",
         ),
     ] = 10.0
+    drift_m: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="standard deviation, m, that errors which steps share add over a metre: "
+            "of offset and calibration, 0.4 % of 20 m",
+        ),
+    ] = 0.018
     acceleration_m_s2: Annotated[
         float,
         Meta(
@@ -467,7 +475,8 @@ class Motion:
         prev_from_curr: pose of this frame in the previous usable one; None at the first frame of a
             drive and at an unusable one.
         covariance: (6, 6) float64 of `prev_from_curr`, left perturbation, [translation in
-            m, rotation in rad]; None if that is.
+            m, rotation in rad], as large as makes chains of motions right, whose errors are partly
+            the same; `odometry` has that of the step by itself. None if the motion is.
         guessed_m: standard deviation of a guess, metres, also where a weak measurement is doubtful;
             0 if odometry measured the motion.
         ahead: at an unusable frame, the guess of the motion since the last usable one, with its
@@ -540,6 +549,7 @@ class GapFiller:
     - Where wheels and gyroscope agree with a measurement that is vaguer, both are weighed.
     - The covariance of measured steps grows with the share of missing steps among the newest, and
       by the distance that earlier ones, refuted by it, were wrong.
+    - Calibration and the offset of disparities err alike from step to step: `drift_m`.
     - Errors of guesses and vague steps in a row have one cause, and add up: at night in rain all
       are too short. Among them the robot may be as fast as when odometry was last sharp.
     - A robot that starts its drive moving, without a measured step, has no known speed. Its first
@@ -653,6 +663,7 @@ class GapFiller:
             self._learn(speed, measured.distance_m, per_s[3:], covariance)
         wrong_m = math.hypot(unsure_m, refuted_m)
         measured, covariance = self._as_sure(measured, covariance, sigma_m, wrong_m, seconds)
+        covariance = covariance + self._drift(measured)
         jumped = refuted_m > self._config.refuted_m
         return Motion(odometry, measured, covariance, unsure_m, jumped=jumped)
 
@@ -756,6 +767,11 @@ class GapFiller:
         adjoint = before.adjoint()
         carried = adjoint @ covariance @ adjoint.T
         return before @ measured, carried + steps**2 * covariance + np.diag(wrong**2)
+
+    def _drift(self, measured: SE3) -> NDArray[np.float64]:
+        """(6, 6) covariance that a measured step adds to the errors that steps share."""
+        variance_m2 = self._config.drift_m**2 * measured.distance_m
+        return np.diag([variance_m2] * 3 + [0.0] * 3)
 
     def _doubt(self, measured: SE3, seconds: float) -> NDArray[np.float64]:
         """(6, 6) additional covariance of a measured step among missing ones.

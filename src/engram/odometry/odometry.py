@@ -23,22 +23,32 @@ class WindowConfig:
     """Settings of the joint optimisation.
 
     Attributes:
-        frames: frames optimised together, including the newest. More than seven gain little.
+        frames: frames optimised together, including the newest. More gain nothing: of 500 landmarks
+            fewer are then in sight.
         landmarks: most landmarks, longest tracks first; bounds the time.
         iterations: most iterations; one or two usually suffice. 0 skips the optimisation.
+        pixel_sigma_px, disparity_sigma_px: standard deviations of a corner and of its disparity, to
+            which the corner's octave and the disparity's own σ add. They are narrower than between
+            matched views: the robust kernel then ignores what blur and drops on the lens drag
+            along by half a pixel. Source: rendered towns.
         offset_sigma_px: standard deviation of the change of a rectified camera's disparity offset
             between successive windows. Each window starts from the last estimate, which converges
             within about ten frames.
     """
 
-    frames: int = 7
+    frames: int = 6
     landmarks: int = 500
     iterations: int = 5
+    pixel_sigma_px: float = 0.1
+    disparity_sigma_px: float = 0.3
     offset_sigma_px: float = 0.1
 
     def __post_init__(self) -> None:
         if self.frames < 2:
             raise ConfigError(f"window: frames is {self.frames}, must be ≥ 2")
+        for name in ("pixel_sigma_px", "disparity_sigma_px", "offset_sigma_px"):
+            if not getattr(self, name) > 0:
+                raise ConfigError(f"window: {name} is {getattr(self, name)}, must be > 0")
         for name, least in (("landmarks", 1), ("iterations", 0)):
             if getattr(self, name) < least:
                 raise ConfigError(f"window: {name} is {getattr(self, name)}, must be ≥ {least}")
@@ -58,7 +68,8 @@ class OdometryConfig:
     """Settings of `Odometry`.
 
     Attributes:
-        matcher: how frames are matched.
+        matcher: how frames are matched. Corners of frames so near to each other are twice as exact
+            as between views 0.4 to 2 m apart; more would let two motions pass as one.
         window: the joint optimisation.
         min_inliers: fewest landmarks that must agree on a motion.
         unexpected_inliers: most inliers that a motion needs after a gap in time, without a
@@ -73,12 +84,16 @@ class OdometryConfig:
             constant velocity. A car brakes with up to 8 m/s²; a head or a handlebar turns with
             10 rad/s² and more.
         max_prediction_s: over a longer interval matching searches the whole frame.
+        steady_m, steady_rad: standard deviations of a step from one at the last speed. Of two
+            motions that landmarks agree on, the one within twice these needs only `steady_share`
+            of the other's inliers: rain and lamps make a second motion.
+        steady_share: see `steady_m`.
         keyframe_flow_px: a frame becomes a keyframe once its landmarks have moved this far in the
             image (median). Below it noise outweighs motion.
         keyframe_share: or once it shows less than this share of the keyframe's landmarks.
     """
 
-    matcher: MatcherConfig = field(default_factory=MatcherConfig)
+    matcher: MatcherConfig = field(default_factory=lambda: MatcherConfig(pixel_sigma_px=0.35))
     window: WindowConfig = field(default_factory=WindowConfig)
     min_inliers: Annotated[int, Meta(ge=6), PUBLIC] = 15
     unexpected_inliers: Annotated[int, Meta(ge=6)] = 60
@@ -89,15 +104,18 @@ class OdometryConfig:
         Meta(
             ge=0,
             description="variances of a step grow by the square of this number over that of its "
-            "inliers: drops on the lens and one's own headlights agree that nothing moves. "
+            "inliers: neighbouring corners err alike, the more so in rain and at night. "
             "Source: `lab/reports/trust.md`",
         ),
-    ] = 400.0
+    ] = 350.0
     acceleration_m_s2: float = 4.0
     angular_acceleration_rad_s2: float = 5.0
-    max_prediction_s: float = 0.25
+    max_prediction_s: float = 0.5
+    steady_m: Annotated[float, Meta(gt=0)] = 0.05
+    steady_rad: Annotated[float, Meta(gt=0)] = 0.01
+    steady_share: Annotated[float, Meta(gt=0, le=1)] = 0.5
     keyframe_flow_px: float = 10.0
-    keyframe_share: float = 0.3
+    keyframe_share: float = 0.4
 
     def __post_init__(self) -> None:
         check_bounds(self)
