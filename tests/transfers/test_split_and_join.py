@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tests.fleet.robots import robot_map
+from tests.maps.test_forgetting import write_town
 
 from engram.errors import InputError, MapCorruptError
 from engram.fleet.transfers import (
@@ -16,6 +17,7 @@ from engram.fleet.transfers import (
     join,
     split,
 )
+from engram.maps.forgetting import Chosen, erase_map
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 
@@ -45,6 +47,25 @@ def test_the_same_map_comes_out(tmp_path, drives):
         assert now.content_hash() == was.content_hash()
         assert now.load().nodes == was.load().nodes
     assert split(tmp_path / "again.engram").manifest.id == taken.manifest.id
+
+
+def test_erased_rows_travel_as_receipts(tmp_path):
+    town, path = write_town(tmp_path / "town.engram"), tmp_path / "town.engram"
+    with Map.open(path) as store:
+        chosen = Chosen(sessions=frozenset([town[-1].session.id]))
+        store.forget_nodes(chosen, author="tests", message="", configuration={})
+    erase_map(path)
+    for at in (3, 4):  # before it was forgotten, and after
+        taken = split(path, at)
+        again = tmp_path / f"again{at}.engram"
+        join(taken.manifest, everything(taken).get, again)
+        assert check_file(again).problems == ()
+        with Map.open(again) as store, Map.open(path, at=at) as was:
+            assert store.content_hash() == was.content_hash()
+            assert len(store.load().nodes) == len(store.read_graph()) == 6
+            pages = store.pages
+            assert sorted(pages.unused(pages.end)) == []
+            pages.experiences(pages.part(0, pages.end).nodes)
 
 
 def test_a_later_map_repeats_little_of_an_earlier_one(drives):

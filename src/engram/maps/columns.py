@@ -25,7 +25,7 @@ _SAID = (
     .where(hidden.c.target.between(bindparam("first"), bindparam("last")))
     .order_by(hidden.c.key)
 )
-# What was erased was hidden first: older views show none of it, either.
+# Older views, which do not know that it was hidden, show nothing of what was erased, either.
 _ERASED = (
     select(receipts.c.target)
     .where(receipts.c.record == bindparam("record"))
@@ -151,14 +151,14 @@ class Visible:
         ask: gives rows of `_SAID`.
         records: the tables that have rows which were ever hidden, by name.
         until: largest key of the rows that are shown, by name of the table; of other tables all.
-        after_erasure: whether the map has erased rows that no visible revision hides.
+        erased: whether the map has erased rows.
     """
 
     places: Mapping[int, int]
     ask: Ask
     records: frozenset[str]
     until: Mapping[str, int] = field(default_factory=dict)
-    after_erasure: bool = False
+    erased: bool = False
     _hidden: dict[str, frozenset[int]] = field(default_factory=dict)
 
     @staticmethod
@@ -173,7 +173,6 @@ class Visible:
         query = select(revisions.c.key, revisions.c.status, place_in_history())
         known = connection.execute(query.order_by(revisions.c.key)).fetchall()
         records = frozenset(connection.exec_driver_sql(_RECORDS).scalars())
-        newest = max((place for _, status, place in known if status == "committed"), default=0)
         erased = connection.execute(select(receipts.c.key).limit(1)).first() is not None
         found = []
         for view in views:
@@ -182,9 +181,8 @@ class Visible:
                 for key, status, place in known
                 if key == view.own or (status == "committed" and place <= view.at)
             }
-            after = erased and view.at < newest
             asks = ask or connection.execute
-            found.append(Visible(places, asks, records, after_erasure=after))
+            found.append(Visible(places, asks, records, erased=erased))
         return found
 
     def as_of_now(self, connection: Connection) -> Visible:
@@ -215,7 +213,8 @@ class Visible:
         return np.isin(keys, list(gone)) if gone else np.zeros(len(keys), np.bool_)
 
     def _hides(self, table: Table, within: Sequence[tuple[int, int]]) -> frozenset[int]:
-        if table.name not in self.records:
+        erased = self.erased and table is nodes  # other erased rows are referred to by none
+        if table.name not in self.records and not erased:
             return frozenset()
         newest: dict[int, tuple[int, int]] = {}
         last_key = self.until.get(hidden.name, LARGEST_KEY)
@@ -226,7 +225,7 @@ class Visible:
                 if key <= last_key and place >= newest.get(target, (0, 0))[0]:
                     newest[target] = place, hides
         gone = {target for target, (_, hides) in newest.items() if hides}
-        for first, last in within if self.after_erasure else ():
+        for first, last in within if erased else ():
             asked = {"record": str(table.name), "first": first, "last": last}
             gone |= {target for (target,) in self.ask(_ERASED, asked)}
         return frozenset(gone)

@@ -11,11 +11,10 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from sqlalchemy import Connection, Table, delete, func, insert, select, update
 
-from engram.config import plain
 from engram.counts import counted
 from engram.errors import RevisionError
 from engram.files import WriterLock
@@ -117,11 +116,6 @@ class Forgotten:
     size_bytes: int
     components: tuple[int, int]
 
-    def to_dict(self) -> dict[str, Any]:
-        """What ``forget --json`` prints."""
-        values: dict[str, Any] = plain(self)
-        return values
-
     def text(self) -> str:
         """The result as text."""
         kinds = (
@@ -157,11 +151,6 @@ class Erased:
     pictures: int
     before_bytes: int
     after_bytes: int | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """What ``forget --erase --json`` prints."""
-        values: dict[str, Any] = plain(self)
-        return values
 
     def text(self) -> str:
         """The result as text."""

@@ -148,7 +148,7 @@ def blame_text(found: Mapping[str, Any]) -> str:
         f"{found['matches']} of {counted(found['attempts'], 'attempt')}",
     ]
     for said in found["told"]:
-        done = "reverted" if said["hidden"] else "shown again"
+        done = "hidden" if said["hidden"] else "shown again"
         lines.append(f"  {done} by revision {said['revision']}")
     return "\n".join(lines)
 
