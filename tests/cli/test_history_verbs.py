@@ -107,7 +107,7 @@ def test_show_of_a_node_names_robot_session_and_revision(engram, town: Path) -> 
     engram("revert", town, 1)
     text = engram("show", town, node.id).out
     assert "saved by r1" in text
-    assert "reverted by revision 3" in text
+    assert "hidden by revision 3" in text
 
 
 @pytest.mark.parametrize(

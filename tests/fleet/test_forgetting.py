@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,19 @@ import pytest
 from tests.maps.maps import begin, session
 
 from engram.errors import ConfigError, InputError, RevisionError
+from engram.fleet.download.coverage import expected_missed
 from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.part import Stock
+from engram.fleet.download.selections import coverage_for
 from engram.fleet.download.updating import update
-from engram.fleet.forgetting import Retention, age_from_text, forget, region_from_text
+from engram.fleet.forgetting import (
+    Retention,
+    age_from_text,
+    forget,
+    region_from_text,
+    serving_order,
+)
 from engram.graph.model import EdgeKind
 from engram.maps.forgetting import erase_map
 from engram.maps.map import Map
@@ -152,6 +162,32 @@ def test_old_drives_and_pictures_are_chosen(tmp_path: Path) -> None:
             Retention(sessions=("xyz",), region=(0.0, 0.0, 1e6)).chosen(store, 0)
         with pytest.raises(InputError, match="--older-than"):
             Retention().chosen(store, 0)
+
+
+def test_a_cap_takes_first_what_serves_least(centre: Path, fleet) -> None:
+    """The drives of the first 24 m are alike but for one that looks different."""
+    alone = fleet["other"][1].saved
+    with Map.open(centre) as store:
+        stock, size_bytes = Stock(store), store.info().size_bytes
+        order = [stock.node_ids[at] for at in serving_order(stock)]
+        assert sorted(order) == sorted(stock.node_ids)
+        first = np.isin(np.arange(len(stock)), serving_order(stock)[: len(stock) // 2])
+        coverage = coverage_for(stock, DownloadOptions(select="budget"))
+        assert expected_missed(coverage, first) < expected_missed(coverage, ~first)
+        half = Retention(down_to=(None, 50.0)).chosen(store, 0).nodes
+        less = Retention(down_to=(int(0.8 * size_bytes), None)).chosen(store, 0).nodes
+        assert 0 < len(less) < len(half) < len(order)
+        assert less <= half == set(order[-len(half) :])
+        landmarks, pictures = store.lookups.blob_sizes(sorted(half)).T
+        assert (landmarks + pictures).sum() + 2600 * len(half) >= size_bytes / 2
+        of_one = Retention(sessions=(drive_of(centre, "r4"),), down_to=(None, 95.0))
+        assert of_one.chosen(store, 0).nodes <= alone.keys()
+        with pytest.raises(InputError, match="are not reached"):
+            replace(of_one, down_to=(1, None)).chosen(store, 0)
+    with pytest.raises(RevisionError, match="nothing of what is to be forgotten"):
+        forget(centre, Retention(down_to=(10**12, None)), author="tests")
+    assert forget(centre, Retention(down_to=(None, 50.0)), author="tests").nodes == len(half)
+    assert check_file(centre).problems == ()
 
 
 def test_where_nothing_lies_nothing_is_forgotten(centre: Path) -> None:

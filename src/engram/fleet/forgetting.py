@@ -10,22 +10,29 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from uuid import UUID
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engram.config import plain
 from engram.errors import ConfigError, InputError
-from engram.fleet.download.part import close_gaps
+from engram.fleet.download.coverage import greedy_order
+from engram.fleet.download.mission import DownloadOptions
+from engram.fleet.download.part import Stock, close_gaps
+from engram.fleet.download.selections import coverage_for
 from engram.fleet.download.surroundings import Surroundings
 from engram.geometry.se3 import SE3
 from engram.graph.graph import EDGE_KINDS
 from engram.graph.model import Clock, Edge, NodeId, SessionId
 from engram.graph.pages import GraphPage
-from engram.maps.forgetting import Chosen, Forgotten
+from engram.maps.forgetting import Chosen, Erased, Forgotten, erase_map
 from engram.maps.map import Map
 
 _NS_PER_DAY = 86_400 * 10**9
+# Bytes of a node besides its landmarks and picture. Source: lab/reports/performance.md.
+_NODE_BYTES = 2600
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +45,15 @@ class Retention:
         older_than_days: age of drives from their starts; None for any. Drives whose time is unknown
             are not old.
         pictures: whether only pictures go.
+        down_to: bytes of the file, or per cent of them, that may stay (`budget_from_text`): of all
+            this only the nodes go that serve least. Both None for no such limit.
     """
 
     sessions: Sequence[str] = ()
     region: tuple[float, float, float] | None = None
     older_than_days: float | None = None
     pictures: bool = False
+    down_to: tuple[int | None, float | None] = (None, None)
 
     def chosen(self, store: Map, now_ns: int) -> Chosen:
         """What that is in a map.
@@ -53,11 +63,12 @@ class Retention:
             now_ns: the time, UTC.
 
         Raises:
-            InputError: nothing is given, or a session is not in the map.
+            InputError: nothing is given, a session is not in the map, or not enough may go.
         """
         if self == Retention():
             raise InputError(
-                "what is to be forgotten? Give --session, --region, --older-than or --pictures"
+                "what is to be forgotten? Give --session, --region, --older-than, --down-to or "
+                "--pictures"
             )
         named = [store.named_session(one) for one in self.sessions]
         drives = named or list(store.sessions.values())
@@ -65,9 +76,53 @@ class Retention:
             before_ns = now_ns - int(self.older_than_days * _NS_PER_DAY)
             drives = [one for one in drives if one.clock is Clock.UTC and one.begin_ns < before_ns]
         ids = frozenset(one.id for one in drives)
-        if self.region is None:
+        inside = None if self.region is None else _within(store, self.region, ids)
+        if self.down_to != (None, None):
+            return Chosen(nodes=self._least_serving(store, ids, inside), pictures=self.pictures)
+        if inside is None:
             return Chosen(sessions=ids, pictures=self.pictures)
-        return Chosen(nodes=_within(store, self.region, ids), pictures=self.pictures)
+        return Chosen(nodes=inside, pictures=self.pictures)
+
+    def _least_serving(
+        self, store: Map, drives: frozenset[SessionId], inside: frozenset[NodeId] | None
+    ) -> frozenset[NodeId]:
+        """Nodes that go so that the rest takes `down_to`; see `serving_order`."""
+        of_bytes, (most_bytes, percent) = store.info().size_bytes, self.down_to
+        if percent is not None:
+            most_bytes = int(of_bytes * percent / 100)
+        assert most_bytes is not None
+        if of_bytes <= most_bytes:
+            return frozenset()
+        stock = Stock(store)
+        landmarks, pictures = stock.sizes
+        sizes = pictures if self.pictures else landmarks + pictures + _NODE_BYTES
+        may_go = np.array(
+            [
+                node.session in drives and (inside is None or node.id in inside)
+                for node in stock.nodes
+            ]
+        )
+        going = serving_order(stock)[::-1]
+        going = going[may_go[going]]
+        freed = np.cumsum(sizes[going])
+        count = int(np.searchsorted(freed, of_bytes - most_bytes)) + 1
+        if count > len(going):
+            raise InputError(
+                f"of {of_bytes} bytes {sizes[may_go].sum()} may go: {most_bytes} are not reached"
+            )
+        return frozenset(stock.node_ids[at] for at in going[:count].tolist())
+
+
+def serving_order(stock: Stock) -> NDArray[np.int64]:
+    """(N,) all nodes, those that serve most first.
+
+    A node serves by the failures that it spares past drives, given those before it: what a download
+    of kind `budget` without an hour takes first. Of nodes that spare none, newer drives come first.
+    """
+    coverage = coverage_for(stock, DownloadOptions(select="budget"))
+    landmarks, pictures = stock.sizes
+    sizes = (landmarks + pictures + _NODE_BYTES).astype(np.float64)
+    return greedy_order(coverage, sizes, np.arange(len(stock))[::-1])
 
 
 def _within(
@@ -133,6 +188,41 @@ def forget(
             configuration={"forget": plain(retention)},
             dry_run=dry_run,
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Retained:
+    """What `forget_and_erase` did, or would do; None for what was not requested."""
+
+    forgotten: Forgotten | None
+    erased: Erased | None
+
+    @property
+    def revision(self) -> int | None:
+        """Number of the new revision; None without one."""
+        return None if self.forgotten is None else self.forgotten.revision
+
+    def to_dict(self) -> dict[str, Any]:
+        """What ``forget --json`` prints."""
+        values: dict[str, Any] = plain(self)
+        return values
+
+    def text(self) -> str:
+        """The result as text."""
+        return "\n".join(one.text() for one in (self.forgotten, self.erased) if one is not None)
+
+
+def forget_and_erase(
+    path: Path, retention: Retention, *, author: str, why: str, erase: bool, dry_run: bool
+) -> Retained:
+    """Forgets what is chosen, if anything is, then erases all that is forgotten, if requested.
+
+    See `forget` and `erase_map`.
+    """
+    hidden = None
+    if not erase or retention != Retention():
+        hidden = forget(path, retention, author=author, why=why, dry_run=dry_run)
+    return Retained(hidden, erase_map(path, dry_run=dry_run) if erase else None)
 
 
 def region_from_text(text: str | None) -> tuple[float, float, float] | None:

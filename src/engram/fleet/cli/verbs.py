@@ -12,6 +12,7 @@ import typer
 from engram.cli import options
 from engram.cli.history import AUTHOR, Message, user
 from engram.cli.options import ExitStatus, PartlyDoneError, VerbInterruptedError
+from engram.cli.wording import undo_text
 from engram.errors import ConfigError, EngramError
 
 if TYPE_CHECKING:
@@ -450,6 +451,12 @@ def forget(
         str | None,
         typer.Option("--older-than", metavar="AGE", help="Drives of that age: 90d."),
     ] = None,
+    down_to: Annotated[
+        str | None,
+        typer.Option(
+            "--down-to", metavar="SIZE", help="Only what serves least, until 2GB or 50% are left."
+        ),
+    ] = None,
     pictures: Annotated[
         bool, typer.Option("--pictures", help="Only the pictures of all this.")
     ] = False,
@@ -472,29 +479,23 @@ def forget(
       engram forget fleet.engram --session 5f3a
       engram forget fleet.engram --region 120,-40,30 --yes --message "asked by the owner"
       engram forget fleet.engram --older-than 90d --pictures --yes
+      engram forget fleet.engram --down-to 2GB
       engram forget fleet.engram --erase --yes
     """
-    from engram.cli.wording import undo_text
-    from engram.fleet.forgetting import Retention, age_from_text, region_from_text
-    from engram.fleet.forgetting import forget as forget_in
-    from engram.maps.forgetting import Erased, Forgotten, erase_map
+    from engram.fleet.download.mission import budget_from_text
+    from engram.fleet.forgetting import Retention, age_from_text, forget_and_erase, region_from_text
 
     retention = Retention(
-        tuple(session or ()), region_from_text(region), age_from_text(older_than), pictures
+        tuple(session or ()),
+        region_from_text(region),
+        age_from_text(older_than),
+        pictures,
+        budget_from_text(down_to, "--down-to"),
     )
-    hidden: Forgotten | None = None
-    erased: Erased | None = None
-    if not erase or retention != Retention():
-        hidden = forget_in(map_path, retention, author=user(), why=message, dry_run=not yes)
-    if erase:
-        erased = erase_map(map_path, dry_run=not yes)
-    lines = [one.text() for one in (hidden, erased) if one is not None]
-    if not yes:
-        lines.append("previewed only: --yes does it")
-    elif hidden is not None and hidden.revision is not None and erased is None:
-        lines.append(undo_text(map_path, hidden.revision))
-    report = {
-        "forgotten": None if hidden is None else hidden.to_dict(),
-        "erased": None if erased is None else erased.to_dict(),
-    }
-    options.show(report, "\n".join(lines), as_json=as_json)
+    done = forget_and_erase(
+        map_path, retention, author=user(), why=message, erase=erase, dry_run=not yes
+    )
+    end = "" if yes else "previewed only: --yes does it"
+    if done.revision is not None and not erase:
+        end = undo_text(map_path, done.revision)
+    options.show(done, f"{done.text()}\n{end}".rstrip(), as_json=as_json)

@@ -122,7 +122,7 @@ def hour_from_text(text: str | None, name: str) -> float | None:
     return int(match["hour"]) + int(match["minute"] or 0) / 60
 
 
-def budget_from_text(text: str | None) -> tuple[int | None, float | None]:
+def budget_from_text(text: str | None, name: str = "budget") -> tuple[int | None, float | None]:
     """Bytes of "200MB", "1.5 GiB" or "4096", or per cent of "25%"; the other is None.
 
     Both are None if `text` is.
@@ -133,7 +133,7 @@ def budget_from_text(text: str | None) -> tuple[int | None, float | None]:
         return None, float(share["number"])
     if (size := bytes_of(text)) is None:
         raise ConfigError(
-            f"budget is {text!r}, must be a size such as 200MB, 1.5GiB or 4096, or a share of "
+            f"{name} is {text!r}, must be a size such as 200MB, 1.5GiB or 4096, or a share of "
             "everything such as 25%"
         )
     return size, None
