@@ -22,8 +22,6 @@ SURE = 7.0
 STRETCHES_M = (100.0, 200.0, 300.0)
 # Shares of errors that the ellipsoids of covariances should hold.
 LEVELS = (0.5, 0.9, 0.99)
-# Lengths over which drift is measured, metres.
-STRETCHES_M = (100.0, 200.0, 300.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,13 +1,15 @@
 """Odometry and disparity of our front-end in the simulated town, against its exact truth.
 
     engram lab simulate village
-    python -m engram_lab.checks.town_accuracy drift [--campaigns DIR]         # all laps, seconds
+    python -m engram_lab.checks.town_accuracy odometry [DIR …]                # all drives, seconds
     python -m engram_lab.checks.town_accuracy disparity --laps 1,4,7          # a minute or so a lap
     python -m engram_lab.checks.town_accuracy disparity --laps 1 --every 40
     python -m engram_lab.checks.town_accuracy rain [--towns 1,4] [--second 0,3]
 
-Drift is KITTI's measure: the error over stretches of 100, 200 and 300 m ÷ their length, one from
-every tenth frame on; the median of each lap, and the median over laps by day and at night.
+Odometry is run again over the frame logs below the folders (default: of `village`), by weather and
+light: steps that are off, errors over 20 m of dead reckoning, and whether covariances hold them.
+Drift is KITTI's measure, too: the error over stretches of 100, 200 and 300 m ÷ their length, one
+from every tenth frame on; the median of each drive.
 
 Disparity: a landmark on the edge of a thing lies, to less than a pixel, on one of two surfaces, and
 the truth at the pixel's centre is the other one's as often as not. So the nearest truth among the
@@ -24,59 +26,131 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from engram.cli.screen import Bars
 from engram.frontend.frame import Landmarks
 from engram.frontend.frontend import Frontend, FrontendConfig
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
+from engram.graph.model import SessionId, node_id
+from engram.localiser.localisation import Position
+from engram.odometry.motion import GapFiller, Motion
+from engram.odometry.odometry import Odometry
 from engram.sequences.framelog.reader import FrameLog
-from engram_lab.accuracy import lap_drift
+from engram_lab.accuracy import LEVELS, lap_drift, squared
 from engram_lab.eyes import JUDGED, Scene, judged_scene
 from engram_lab.programs import Figure, command_line, numbers, report
 from engram_lab.town.campaigns import Campaign, campaign_named
-from engram_lab.town.conditions import Conditions
 from engram_lab.town.rendering import Places
 from engram_lab.town.session import SimulatedDrive
-from engram_lab.town.simulating import campaign_folder, campaigns_folder
-from engram_lab.truth import read_truth
+from engram_lab.town.simulating import campaign_folder, campaigns_folder, met_path
+from engram_lab.truth import read_truth, truth_path
 
+_OFF_M, _RECKONED_M = 0.2, 20.0
+# Lamps are on below.
+_NIGHT_BELOW_DEG = -2.0
 _RAINY = ("rain", "rain again", "rain at night", "fog", "morning")
 
 
-def drift(campaign: Campaign, campaigns: Path) -> None:
-    """Prints each lap's drift, and the medians."""
-    by_light: dict[str, list[float]] = {"by day": [], "by night": []}
-    for plan in campaign.sessions:
-        path = campaign_folder(campaigns, campaign) / f"{plan.name}.framelog"
-        truth = read_truth(path)
-        if truth is None:
-            raise SystemExit(f"{path}: not rendered; run: engram lab simulate {campaign.home}")
-        moment = Conditions(plan.start, plan.weather, plan.seed, campaign.place).at(0, 0)
-        light = "by night" if moment.lamps_on else "by day"
-        log = FrameLog(path)
-        steps = [one.odometry.prev_from_curr for one in log]
-        log.close()
-        lost = sum(step is None for step in steps[1:])
-        poses = list(
-            itertools.accumulate(
-                (SE3.identity() if step is None else step for step in steps[1:]),
-                lambda pose, step: pose @ step,
-                initial=SE3.identity(),
-            )
+@dataclass(slots=True)
+class Driven:
+    """What odometry made of drives in one kind of conditions.
+
+    Attributes:
+        errors_m: of each step; NaN where odometry gave none.
+        steps, reckoned: χ² of steps, and of 20 m of dead reckoning, with their covariances.
+        drifts: error over 20 m, as a share of it.
+        laps: drift of each drive over 100 m and more.
+    """
+
+    errors_m: list[float] = field(default_factory=list)
+    steps: list[float] = field(default_factory=list)
+    reckoned: list[float] = field(default_factory=list)
+    drifts: list[float] = field(default_factory=list)
+    laps: list[float] = field(default_factory=list)
+
+    def figures(self, name: str) -> Iterator[Figure]:
+        """Rows of a table."""
+        errors_m = np.array(self.errors_m)
+        yield Figure(f"{name}: drives", len(self.laps))
+        yield Figure(
+            f"  steps over {_OFF_M} m off", 100 * float((~(errors_m < _OFF_M)).mean()), "%"
         )
-        lap = lap_drift(poses, list(truth.world_from_cam))
-        by_light[light].append(lap)
-        print(f"{plan.name:45} {light:9} {100 * lap:6.2f} %  {lost:3} frames without motion")
-    for light, laps in by_light.items():
-        asked = "1" if light == "by day" else "2"
-        print(
-            f"median {light}: {100 * float(np.median(laps)):.2f} % of {len(laps)} laps (≤ {asked})"
-        )
+        yield Figure("  step, median error", 1e3 * float(np.nanmedian(errors_m)), "mm")
+        yield Figure(f"  drift over {_RECKONED_M:.0f} m", 100 * float(np.median(self.drifts)), "%")
+        yield Figure("  drift over 100 m and more", 100 * float(np.mean(self.laps)), "%")
+        for what, values in (("steps", self.steps), ("dead reckoning", self.reckoned)):
+            for level in LEVELS:
+                inside = float((np.array(values) <= chi2.ppf(level, 6)).mean())
+                yield Figure(f"  {what} inside {100 * level:.0f} %", 100 * inside, "%")
+
+
+def odometry(folders: Sequence[Path]) -> Iterator[Figure]:
+    """Runs odometry again over the rendered drives in folders, by weather and light."""
+    found: dict[str, Driven] = {}
+    for path in sorted(path for folder in folders for path in folder.rglob("*.framelog")):
+        if truth_path(path).exists():
+            _drive(path, found.setdefault(_conditions(path), Driven()))
+    if not found:
+        raise SystemExit("no rendered drives there; run: engram lab simulate village")
+    for name, driven in sorted(found.items()):
+        yield from driven.figures(name)
+
+
+def _conditions(path: Path) -> str:
+    """Weather and light of a rendered drive."""
+    head = truth_path(path).read_text().splitlines()[0]
+    sun_deg = float(met_path(path).read_text().splitlines()[1].split(",")[3])
+    weather = head.split(": ")[1].split(",")[0]
+    return f"{weather}, {'day' if sun_deg > _NIGHT_BELOW_DEG else 'night'}"
+
+
+def _drive(path: Path, driven: Driven) -> None:
+    truth = read_truth(path)
+    assert truth is not None
+    world_from_cam = list(truth.world_from_cam)
+    log, engine, gaps = FrameLog(path), Odometry(), GapFiller()
+    motions = []
+    for logged in log:
+        step, landmarks = engine.step(logged.frame), len(logged.frame.landmarks)
+        motions.append(gaps.motion(step, logged.frame.stamp_ns, landmarks=landmarks))
+    log.close()
+    for motion, (before, now) in zip(motions[1:], pairwise(world_from_cam), strict=True):
+        step, true = motion.odometry, before.inverse() @ now
+        if step.prev_from_curr is None or step.covariance is None:
+            driven.errors_m.append(float("nan"))
+            continue
+        driven.errors_m.append((true.inverse() @ step.prev_from_curr).distance_m)
+        driven.steps.append(squared(step.prev_from_curr, step.covariance, true))
+    moved = [one.prev_from_curr or SE3.identity() for one in motions[1:]]
+    poses = list(itertools.accumulate(moved, lambda pose, one: pose @ one, initial=SE3.identity()))
+    driven.laps.append(lap_drift(poses, world_from_cam))
+    _reckon(motions, world_from_cam, driven)
+
+
+def _reckon(motions: Sequence[Motion], truth: Sequence[SE3], driven: Driven) -> None:
+    """Dead reckoning from every fifth frame on."""
+    for first in range(0, len(motions), 5):
+        at = Position.at(node_id(SessionId(UUID(int=0)), 0))
+        for last in range(first + 1, len(motions)):
+            one = motions[last]
+            if one.prev_from_curr is None or one.covariance is None:
+                break
+            at = at.carried_on(one.prev_from_curr, one.covariance)
+            true = truth[first].inverse() @ truth[last]
+            if true.distance_m >= _RECKONED_M:
+                off_m = (true.inverse() @ at.node_from_live).distance_m
+                driven.drifts.append(off_m / true.distance_m)
+                driven.reckoned.append(squared(at.node_from_live, at.covariance, true))
+                break
 
 
 def disparity(campaign: Campaign, laps: Sequence[int], every: int) -> None:
@@ -175,16 +249,17 @@ def _counted(
 
 def main() -> None:
     parser = command_line(__doc__)
-    parser.add_argument("what", choices=("drift", "disparity", "rain"))
-    parser.add_argument("--campaigns", type=Path, default=campaigns_folder())
+    parser.add_argument("what", choices=("odometry", "disparity", "rain"))
+    parser.add_argument("folders", nargs="*", type=Path, metavar="DIR", help="of rendered drives")
     parser.add_argument("--laps", type=numbers, default=[1, 4, 7], help="joined by commas")
     parser.add_argument("--every", type=int, default=20, help="frames between those looked at")
     parser.add_argument("--towns", type=numbers, default=[1, 4], help="judged towns of rain")
     parser.add_argument("--second", type=numbers, default=[0, 3], help="thresholds; 0: none")
     asked = parser.parse_args()
     village = campaign_named("village")
-    if asked.what == "drift":
-        drift(village, asked.campaigns)
+    if asked.what == "odometry":
+        folders = asked.folders or [campaign_folder(campaigns_folder(), village)]
+        report(odometry(folders), asked.json, "odometry")
     elif asked.what == "disparity":
         disparity(village, asked.laps, asked.every)
     else:

@@ -1226,7 +1226,9 @@ def _add_motion(one: _Coverage, there: Street) -> None:
                 sharp = _sigma_m(covariance) < _SHARP_M
                 one.sharp += sharp
                 one.wrong_sharp += sharp and (step.inverse() @ true).distance_m > _WRONG_STEP_M
-                one.steps.append(squared(step, covariance, true))
+                by_itself = logged.odometry
+                if by_itself.prev_from_curr is not None and by_itself.covariance is not None:
+                    one.steps.append(squared(by_itself.prev_from_curr, by_itself.covariance, true))
             open_ = [(start, at.carried_on(step, covariance)) for start, at in open_]
         elif last is not None:
             open_ = []
