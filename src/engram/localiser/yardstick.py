@@ -29,12 +29,14 @@ from engram.graph.model import EdgeKind, NodeId
 
 # Log-odds that a match is a look-alike: constant, and weights of ln(inliers / usual inliers), of
 # `more_bits` and of ln(`unevenness`); of one match at most. Source: `lab/reports/lookalikes.md`.
-_ALIKE, _OF_SHARE, _OF_BITS, _OF_UNEVENNESS = -7.0, -4.5, -0.1, 3.8
+_ALIKE, _OF_SHARE, _OF_BITS, _OF_UNEVENNESS = -6.6, -4.5, -0.1, 3.8
 _MOST = 3.0
 # A chain has a node each metre or so; a node farther away shows other things.
 _NEIGHBOUR_M = 4.0
 # Places are parts of the image's width, and of the distance up to the farthest in equal ratios.
 _COLUMNS, _DEPTHS, _FARTHEST_M = 8, 8, 64.0
+# Usual landmarks in view of a frame of 600.
+_COUNTED = 175
 # Nearer or farther than by this factor a landmark looks different.
 _SAME_SIZE = 1.5
 # Less says no more: of few landmarks chance makes it small.
@@ -167,6 +169,7 @@ def unevenness(landmarks: Landmarks, usual: NDArray[np.int32], found: NDArray[np
 
     Places are columns of the image at one distance. The likelihood ratio of a rate each against one
     rate for all (the G statistic), over its degrees of freedom: about 1 where chance alone decides.
+    What is beyond chance grows with the number of landmarks, and counts as of `_COUNTED` of them.
 
     Args:
         landmarks: those of the node.
@@ -185,7 +188,8 @@ def unevenness(landmarks: Landmarks, usual: NDArray[np.int32], found: NDArray[np
     rate = float(np.clip(hits.mean(), 0.02, 0.98)) if len(hits) else 0.5
     rates = np.clip(hit / there, 1e-9, 1 - 1e-9)
     gained = hit * np.log(rates / rate) + (there - hit) * np.log((1 - rates) / (1 - rate))
-    return float(2 * gained.sum() / max(len(there) - 1, 1))
+    beyond_chance = float(2 * gained.sum() / max(len(there) - 1, 1)) - 1
+    return 1 + beyond_chance * min(_COUNTED / max(len(usual), 1), 1.0)
 
 
 def _in_view(match: Match, reference: Frame, live: Frame, usual: Usual) -> NDArray[np.int32]:
