@@ -25,11 +25,24 @@ class Inner:
 class Outer:
     name: str = "x"
     inner: Inner = field(default_factory=Inner)
+    other: Inner = field(default_factory=lambda: Inner(share=0.25))
     maybe: Inner | None = None
+
+
+@dataclass(frozen=True)
+class Outermost:
+    outer: Outer = field(default_factory=lambda: Outer(inner=Inner(size=9)))
 
 
 def test_what_is_not_said_keeps_its_default() -> None:
     assert load_toml("[inner]\nsize = 7", Outer) == Outer(inner=Inner(size=7))
+
+
+def test_a_table_keeps_its_own_default_where_its_type_has_another() -> None:
+    assert load_toml("[other]\nsize = 7", Outer).other == Inner(7, 0.25)
+    found = load_toml("[outer.inner]\nshare = 0.75", Outermost).outer
+    assert found == Outer(inner=Inner(9, 0.75))
+    assert load_toml('[outer]\nname = "y"', Outermost).outer.inner == Inner(9)
 
 
 @pytest.mark.parametrize("text", ["nam = 1", "[inner]\nsiez = 1", "[maybe]\nsiez = 1"])

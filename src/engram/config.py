@@ -95,9 +95,35 @@ def from_dict(values: dict[str, Any], kind: type[T], ignored: Collection[str] = 
     _refuse_unknown_keys(values, kind, "", ignored)
     values = {key: value for key, value in values.items() if key not in ignored}
     try:
-        return msgspec.convert(values, kind)
+        return msgspec.convert(_over_defaults(values, kind), kind)
     except msgspec.ValidationError as error:
         raise ConfigError(_in_words(error, values)) from error
+
+
+def _over_defaults(values: dict[str, Any], kind: Any) -> dict[str, Any]:
+    """Values over the defaults of the tables that they are in.
+
+    A table's default may differ from that of its type: what is not given keeps the former.
+    """
+    if not dataclasses.is_dataclass(kind):
+        return values
+    whole = dict(values)
+    for field in dataclasses.fields(kind):
+        given, default = values.get(field.name), field.default
+        if field.default_factory is not dataclasses.MISSING and isinstance(given, dict):
+            default = field.default_factory()
+        if isinstance(given, dict) and dataclasses.is_dataclass(default):
+            whole[field.name] = _over(given, default)
+    return whole
+
+
+def _over(given: dict[str, Any], default: Any) -> dict[str, Any]:
+    whole = to_dict(default)
+    for key, value in given.items():
+        table = getattr(default, key)
+        nested = isinstance(value, dict) and dataclasses.is_dataclass(table)
+        whole[key] = _over(value, table) if nested else value
+    return whole
 
 
 def _in_words(error: msgspec.ValidationError, values: dict[str, Any]) -> str:

@@ -100,7 +100,7 @@ def test_tracking_gives_up_what_does_not_come_back():
     moved = np.roll(image, 3, axis=1)
     moved[60:] = 128
     pixels = np.array([[40, 30], [80, 40], [60, 80]], dtype=np.float32)
-    there, found = tracked(image, moved, pixels)
+    there, found = tracked(image, moved, pixels, pixels)
     assert found.tolist() == [True, True, False]
     np.testing.assert_allclose((there - pixels)[:2], [[3, 0]] * 2, atol=0.1)
 
@@ -109,11 +109,11 @@ def test_a_camera_at_rest_has_not_moved_and_a_black_one_says_nothing():
     camera = StereoCamera(260.0, 260.0, 160.0, 120.0, 0.2, 320, 240)
     left, right = shifted_pair(240, 320, 12.25, seed=1, noise=2.0)
     pair = StereoPair(1, left, right, camera)
-    found = motion(pair, pair)
+    found = motion(pair, pair, SE3.identity())
     assert found is not None
     assert found.distance_m < 1e-3
     black = StereoPair(2, np.zeros_like(left), np.zeros_like(right), camera)
-    assert motion(black, pair) is None
+    assert motion(black, pair, SE3.identity()) is None
 
 
 def test_shares_are_compared_over_the_same_places():

@@ -28,7 +28,7 @@ from engram_lab.town.session import SimulatedDrive
 
 _CAMPAIGN = "hamlet"
 _ZONE = "Europe/London"
-# Of 1 to 100. As PNG the drives are 16 MB, so 6.0 MB; 34 of 40 frames are localised.
+# Of 1 to 100. As PNG the drives are 16 MB, so 6.0 MB; 33 of 40 frames are localised.
 _QUALITY = 90
 _JPEG = (
     cv2.IMWRITE_JPEG_QUALITY, _QUALITY, cv2.IMWRITE_JPEG_OPTIMIZE, 1,
