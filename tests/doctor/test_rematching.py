@@ -114,7 +114,8 @@ def test_a_robot_that_localises_is_told_that_its_calibration_is_wrong(
     )
     assert found.code == code
     assert words in found.message
-    assert found.value == pytest.approx(abs(focal * baseline - 1), abs=0.015)
+    # Of the few frames that were fixed and matched again.
+    assert found.value == pytest.approx(abs(focal * baseline - 1), abs=0.02)
 
 
 def test_of_a_right_calibration_it_hears_nothing(mapped: Path) -> None:
