@@ -107,23 +107,22 @@ def _over_defaults(values: dict[str, Any], kind: Any) -> dict[str, Any]:
     """
     if not dataclasses.is_dataclass(kind):
         return values
-    whole = dict(values)
-    for field in dataclasses.fields(kind):
-        given, default = values.get(field.name), field.default
-        if field.default_factory is not dataclasses.MISSING and isinstance(given, dict):
-            default = field.default_factory()
-        if isinstance(given, dict) and dataclasses.is_dataclass(default):
-            whole[field.name] = _over(given, default)
-    return whole
+    fields = {one.name: one for one in dataclasses.fields(kind)}
+    return {key: _over(value, _default(fields[key])) for key, value in values.items()}
 
 
-def _over(given: dict[str, Any], default: Any) -> dict[str, Any]:
-    whole = to_dict(default)
-    for key, value in given.items():
-        table = getattr(default, key)
-        nested = isinstance(value, dict) and dataclasses.is_dataclass(table)
-        whole[key] = _over(value, table) if nested else value
-    return whole
+def _default(field: dataclasses.Field[Any]) -> Any:
+    if field.default_factory is dataclasses.MISSING:
+        return field.default
+    return field.default_factory()
+
+
+def _over(given: Any, default: Any) -> Any:
+    """A value; over its default if both are tables."""
+    if not isinstance(given, dict) or not dataclasses.is_dataclass(default):
+        return given
+    merged = {key: _over(value, getattr(default, key)) for key, value in given.items()}
+    return to_dict(default) | merged
 
 
 def _in_words(error: msgspec.ValidationError, values: dict[str, Any]) -> str:

@@ -144,7 +144,8 @@ class Erased:
     Attributes:
         rows: number of rows erased by table; each has left a receipt.
         pictures: number of erased ones.
-        before_bytes, after_bytes: size of the file; after a dry run there is none.
+        before_bytes: size of the file.
+        after_bytes: the same afterwards; None for a dry run.
     """
 
     rows: Mapping[str, int]

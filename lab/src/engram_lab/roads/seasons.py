@@ -3,8 +3,8 @@
     python -m engram_lab.roads.seasons [--towns 504,505,506] [--only rain,night] [--rows roads.csv]
 
 OpenCV's SIFT, one picture at a time. What counts is the share within 5 m and 10° and its difference
-to another overcast day. Towns 504 to 506 are for judging: nothing is ever tuned on them.
-501 to 503 judged an earlier choice of light and works.
+to another overcast day. Towns 504 to 506 are for judging: no light, weather or change of the town
+is ever set by them. 501 to 503 judged an earlier choice.
 
 The road's differences are those of SIFT, ratio test and NetVLAD retrieval on RobotCar Seasons'
 training split, by condition.
