@@ -13,11 +13,11 @@ from tests.sequences.synthetic import only_engram_errors, write_log
 from engram.errors import InputError
 from engram.geometry.se3 import SE3
 from engram.measures import FORMULAS, Drive, Estimator, failure, failure_sums, gaps
-from engram.sequences.motion_files import Trajectory, write_tum
+from engram.sequences.motion_files import Trajectory, read_kitti_poses, write_tum
 from engram.sequences.opening import open_drive
 from engram_lab.accuracy import PoseErrors
 from engram_lab.intervals import Resamples, SessionSums, difference, excess_ratio, ratio
-from engram_lab.truth import read_kitti_poses, read_matrix_truth, read_truth, truth_path
+from engram_lab.truth import read_matrix_truth, read_truth, truth_path
 from engram_lab.wheels import SCALE, Wheels, measured
 
 

@@ -23,7 +23,7 @@ COMMANDS = typer.main.get_command(app).commands
 SCREEN = 60
 # Options that its help shows, --help among them, and arguments and options of all verbs.
 MOST_OPTIONS = 12
-MOST_ARGUMENTS = 307
+MOST_ARGUMENTS = 312
 
 
 def every_verb(commands: dict, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

@@ -17,7 +17,7 @@ from engram.localiser.localiser import Localiser
 FRAME_KEYS = {
     "stamp_ns", "status", "node", "node_stamp_ns", "node_from_live", "inliers", "attempts",
     "confidence", "withdraws",
-    "candidates", "open_loop_m", "ms", "damaged", "fixed_share",
+    "candidates", "open_loop_m", "ms", "damaged", "fixed_share", "step_m", "map_from_live",
 }  # fmt: skip
 STATUSES = {"localised", "dead_reckoning", "lost", "no_odometry"}
 
@@ -58,7 +58,7 @@ def test_localise_remembers_a_drive_without_nodes(engram, street: Path, town: Pa
 
 def test_localise_gives_the_documented_json(engram, street: Path, town: Path) -> None:
     result = engram("localise", town, street, "--json").json
-    assert set(result) == {"summary", "frames"}
+    assert set(result) == {"map", "drive", "summary", "frames"}
     assert result["summary"]["frames"] == len(result["frames"]) == 12
     for frame in result["frames"]:
         assert set(frame) == FRAME_KEYS

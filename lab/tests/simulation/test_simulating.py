@@ -14,12 +14,13 @@ from engram.frontend.frontend import Frontend, FrontendConfig
 from engram.monitor import Monitor
 from engram.robot.settings import Settings
 from engram.sequences.framelog.reader import FrameLog
+from engram.sequences.motion_files import read_kitti_poses
 from engram.sequences.opening import open_drive
 from engram.sequences.sequence import first_pair_hash, session_of
 from engram_lab.town.campaigns import Campaign, campaign_named
 from engram_lab.town.session import SimulatedSequence
 from engram_lab.town.simulating import campaign_folder, met_path, simulate
-from engram_lab.truth import read_kitti_poses, read_truth, truth_path
+from engram_lab.truth import read_truth, truth_path
 
 
 @pytest.fixture(scope="module")

@@ -234,7 +234,16 @@ def localise(
     if explain is None:
         asked = RobotOptions(**tried, deadline_ms=deadline)
         wanted = Outputs(
-            map_path, trajectory, pictures, rate, as_json, remember, recorder, not no_images, view
+            map_path,
+            path,
+            trajectory,
+            pictures,
+            rate,
+            as_json,
+            remember,
+            recorder,
+            not no_images,
+            view,
         )
         with losses_told(sequence), open_map(map_path, at) as opened:
             _follow(opened, resolved)

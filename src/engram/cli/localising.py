@@ -17,8 +17,11 @@ if TYPE_CHECKING:
     from engram.maps.map import Map
     from engram.robot.explaining import ExplainedCandidate, ExplainOptions, Explanation
     from engram.robot.recorder import Recorder
+    from engram.robot.results import ResultRecords
+    from engram.robot.robot import Robot
     from engram.robot.settings import RobotOptions, Settings
     from engram.sequences.opening import Drive
+    from engram.viewing.pictures import PictureWriter
 
 
 # So many match pictures are spread over a drive: enough to leaf through.
@@ -30,7 +33,7 @@ class Outputs:
     """Where the results go, and the map as the next command names it.
 
     Attributes:
-        map_path: the map, as it was typed.
+        map_path, drive: the map and the drive, as they were typed.
         trajectory: file in TUM format; None for none.
         pictures: folder of match pictures; None for none.
         rate_hz: replay in real time; None for as fast as it goes.
@@ -42,6 +45,7 @@ class Outputs:
     """
 
     map_path: Path
+    drive: Path
     trajectory: Path | None
     pictures: Path | None
     rate_hz: float | None
@@ -64,16 +68,15 @@ def localise_and_print(
     Raises:
         Exit: it was interrupted.
     """
-    from engram.cli.screen import Bars
     from engram.cli.wording import localised_text, warnings
+    from engram.robot.results import ResultRecords
+    from engram.robot.robot import DisplayPose
     from engram.robot.starting import robot_on, summarise
     from engram.sequences.opening import stamps_of
     from engram.viewing.pictures import PictureWriter
     from engram.viewing.trajectory import write_trajectory
     from engram.viewing.viewer import viewer_for
 
-    results: list[Localisation] = []
-    interrupted = False
     with (
         viewer_for(outputs.view) as viewer,
         robot_on(opened, sequence, settings, asked, remembers=outputs.remember) as robot,
@@ -81,19 +84,12 @@ def localise_and_print(
         if viewer is not None:
             viewer.watch(robot, opened)
         robot.recorder = _recorder(opened, sequence, outputs)
-        writer = None
+        records = ResultRecords(DisplayPose(opened.frame, robot.graph))
+        pictures = None
         if outputs.pictures is not None:
             every = max(1, len(sequence) // _PICTURES)
-            writer = PictureWriter(outputs.pictures, every, opened.frames)
-        with Bars().stage("localise", len(sequence)) as monitor:
-            try:
-                for found in robot.drive(sequence, monitor, outputs.rate_hz):
-                    results.append(found)
-                    if writer is not None and robot.last is not None:
-                        writer.offer(robot.last, found)
-            except KeyboardInterrupt:
-                interrupted = True
-                typer.echo("interrupted: the summary covers the frames so far", err=True)
+            pictures = PictureWriter(outputs.pictures, every, opened.frames)
+        results, interrupted = _driven(robot, sequence, outputs.rate_hz, records, pictures)
         if outputs.trajectory is not None:
             write_trajectory(outputs.trajectory, opened.graph, results)
     fatal = robot.diagnosis.fatal
@@ -108,15 +104,41 @@ def localise_and_print(
     if outputs.remember:
         summary["remembered"] = {"state": robot.saving.state, "revision": robot.saving.revision}
     summary |= _records(robot.recorder)
-    frames = [result.to_dict() for result in results]
+    frames = records.frames(results)
     for warning in () if outputs.as_json else warnings(summary):
         typer.echo(warning, err=True)
     text = [localised_text(summary, frames, outputs.map_path)]
     text += [robot.saving.text()] if outputs.remember else []
-    show({"summary": summary, "frames": frames}, "\n".join(text), as_json=outputs.as_json)
+    places = {"map": str(outputs.map_path), "drive": str(outputs.drive)}
+    whole = {**places, "summary": summary, "frames": frames}
+    show(whole, "\n".join(text), as_json=outputs.as_json)
     if interrupted:
         raise typer.Exit(ExitStatus.INTERRUPTED)
     untrusted_if(fatal)
+
+
+def _driven(
+    robot: Robot,
+    sequence: Drive,
+    rate_hz: float | None,
+    records: ResultRecords,
+    pictures: PictureWriter | None,
+) -> tuple[list[Localisation], bool]:
+    """The results of the drive, and whether Ctrl-C ended it."""
+    from engram.cli.screen import Bars
+
+    results: list[Localisation] = []
+    with Bars().stage("localise", len(sequence)) as monitor:
+        try:
+            for found in robot.drive(sequence, monitor, rate_hz):
+                results.append(found)
+                records.see(found)
+                if pictures is not None and robot.last is not None:
+                    pictures.offer(robot.last, found)
+        except KeyboardInterrupt:
+            typer.echo("interrupted: the summary covers the frames so far", err=True)
+            return results, True
+    return results, False
 
 
 def _recorder(opened: Map, sequence: Drive, outputs: Outputs) -> Recorder | None:

@@ -76,6 +76,23 @@ def read_poses(path: str | Path) -> list[tuple[int, SE3]]:
     return read_rows(path, stamped)
 
 
+def read_kitti_poses(path: str | Path, stamps_ns: Sequence[int] | NDArray[np.int64]) -> Trajectory:
+    """KITTI's format: line i is the (3, 4) pose of the left camera at frame i, by rows.
+
+    Args:
+        stamps_ns: (N,) int64 stamps of the frames, ns, one per line; the file has none.
+    """
+    poses = read_rows(path, matrix_pose)
+    if len(poses) != len(stamps_ns):
+        raise SequenceError(f"{path}: {len(poses)} poses for {len(stamps_ns)} stamps")
+    return trajectory_of(path, zip(stamps_ns, poses, strict=True))
+
+
+def matrix_pose(fields: list[str]) -> SE3:
+    """The pose of the 12 numbers of a (3, 4) matrix, by rows; see `read_rows`."""
+    return SE3.from_matrix(np.array(finite(fields, 12)).reshape(3, 4))
+
+
 def write_tum(path: str | Path, trajectory: Trajectory, comments: Sequence[str] = ()) -> None:
     """Writes TUM format with stamps to the nanosecond; replaces an existing file atomically."""
     path = Path(path)

@@ -34,7 +34,7 @@ from engram.monitor import QUIET, Monitor
 from engram.robot.mapping import Beginning, map_drive
 from engram.robot.robot import LastFrame
 from engram.robot.settings import RobotOptions, Settings
-from engram.sequences.motion_files import Trajectory
+from engram.sequences.motion_files import Trajectory, read_kitti_poses
 from engram.sequences.opening import open_drive
 from engram_lab.accuracy import Fix, events, way_m
 from engram_lab.studies.building import edge_errors
@@ -53,7 +53,7 @@ from engram_lab.studies.faults.staging import (
     fault_of,
     staged,
 )
-from engram_lab.truth import read_kitti_poses, read_matrix_truth
+from engram_lab.truth import read_matrix_truth
 
 
 def map_on(trial: Trial, scene: Scene, path: Path) -> None:
