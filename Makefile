@@ -18,7 +18,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: setup demo centre-demo test test-services test-long test-ros goldens check format clean \
 	docs wheels test-wheels test-arm64 release-steps test-opencv test-clang test-sanitizers \
-	needs-clang needs-sanitizers
+	needs-clang needs-sanitizers pages release-check
 
 setup: $(STAMP)
 
@@ -117,6 +117,14 @@ docs: setup
 # Source distributions and wheels in dist/: one for 3.11, one for 3.12 and later.
 wheels:
 	$(PYTHON) release/wheels.py
+
+# The blocks and pictures of README, docs and reports, from the tables in lab/reports/tables.
+pages: setup
+	$(BIN)/python -m engram_lab.studies.pages draw
+
+# Fails where a drawn figure is of an older method, world or command than the program's.
+release-check: setup
+	$(BIN)/python -m engram_lab.studies.pages release
 
 # In bare environments of every Python at hand; ON=3.12 picks one, SUITE=1 runs all tests there.
 test-wheels: setup

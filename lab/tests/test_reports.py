@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from engram_lab.checks.paper_figures import read, sessions_of
 from engram_lab.intervals import Resamples, SessionSums, difference
+from engram_lab.studies.paper_figures import read, sessions_of
 
 REPORTS = sorted((Path(__file__).parents[1] / "reports").glob("*.md"))
 
@@ -53,7 +53,7 @@ def test_printed_intervals_are_those_of_the_kept_rows(what):
     (line,) = [one for one in text.splitlines() if one.startswith(f"| {what}, route not localised")]
     printed = [tuple(float(x.replace("−", "-")) for x in one) for one in POINTS.findall(line)]
     assert len(printed) == 2
-    rows = read(FOLDER / "fleet_sessions.csv")
+    rows = read(FOLDER / "tables/fleet/sessions.csv")
     for arm, told in zip("AB", printed, strict=True):
         ours, theirs = (sessions_of(rows, arm, "9", name) for name in PAIRS[what])
         there = {(one["fold"], one["drive"]) for one in theirs}

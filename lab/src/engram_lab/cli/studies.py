@@ -576,3 +576,56 @@ def scale(
         print(json.dumps([{"nodes": one.nodes, **one.values} for one in found]))
     else:
         typer.echo(f"{table(found)}\n{out}")
+
+
+@evaluate.command("all")
+def everything(
+    *,
+    only: Annotated[
+        str | None,
+        typer.Option("--only", metavar="NAME,NAME…", help="Run these studies [default: all]."),
+    ] = None,
+    hours: Annotated[
+        float | None,
+        typer.Option("--hours", metavar="N", min=0.0, help="Run what fits into so many hours."),
+    ] = None,
+    planned: Annotated[
+        bool, typer.Option("--plan", help="Show what is done, stale or missing; run nothing.")
+    ] = False,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="A folder of results for each study.")
+    ] = Path("results"),
+    as_json: options.Json = False,
+) -> None:
+    """Run every study that README and docs rest on.
+
+    The same command resumes. Results are stale once the method, the world or a study's commands
+    have changed; they are set aside. A study's manifest stands next to its tables: versions,
+    commands, settings, machine and time. `python -m engram_lab.studies.pages keep` takes tables
+    into the repository and draws the pages.
+
+    \b
+    Examples:
+      engram lab evaluate all --plan
+      engram lab evaluate all --hours 1
+      engram lab evaluate all --only real-images,conditions --out results
+    """
+    from dataclasses import asdict
+
+    from engram.errors import EngramError
+    from engram_lab.studies.evidence import COLUMNS, plan, run_all
+    from engram_lab.studies.plan import plain_table
+
+    names = only.split(",") if only else []
+    found = plan(out, names)
+    if not planned:
+        failed = run_all(out, names, hours, lambda line: typer.echo(line, err=True))
+        found = plan(out, names)
+    if as_json:
+        print(json.dumps([asdict(one) for one in found]))
+    else:
+        left = sum(one.minutes for one in found if one.to_run)
+        typer.echo("\n".join(plain_table([one.row() for one in found], COLUMNS)))
+        typer.echo(f"{left / 60:.1f} hours left on two cores")
+    if not planned and failed:
+        raise EngramError(f"{len(failed)} of the studies failed: {', '.join(failed)}")

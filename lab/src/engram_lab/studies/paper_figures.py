@@ -1,13 +1,11 @@
-"""Draws the four pictures of docs/papers.md from the tables of the studies.
-
-    python -m engram_lab.checks.paper_figures             # lab/reports → docs/pictures
+"""The four pictures of docs/papers.md, from the tables of the studies.
 
 At most four curves each, a logarithmic axis where ratios matter, intervals (90 %) as bars.
+`engram_lab.studies.pages` writes them.
 """
 
 from __future__ import annotations
 
-import argparse
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -45,9 +43,9 @@ def read(path: Path) -> list[Row]:
         return list(csv.DictReader(file))
 
 
-def pooled(rows: Sequence[Row]) -> list[Row]:
-    """The pooled rows of `begbroke` at the studies' usual settings."""
-    usual = {"campaign": "begbroke", "rounds": "1", "T": "10", "radius": "search", "mode": "memo",
+def pooled(rows: Sequence[Row], campaign: str = "begbroke") -> list[Row]:
+    """The pooled rows of a campaign at the studies' usual settings."""
+    usual = {"campaign": campaign, "rounds": "1", "T": "10", "radius": "search", "mode": "memo",
              "paths": "matched+saved", "fold": "all"}  # fmt: skip
     return [one for one in rows if all(one[name] == value for name, value in usual.items())]
 
@@ -164,23 +162,13 @@ def _ended(figure: Figure, axes: Axes, *, logarithmic: bool) -> Figure:
     return figure
 
 
-def main() -> None:
-    """Draws all four."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--reports", type=Path, default=Path("lab/reports"))
-    parser.add_argument("--out", type=Path, default=Path("docs/pictures"))
-    asked = parser.parse_args()
-    ranking = read(asked.reports / "ranking_summary.csv")
-    fleet = read(asked.reports / "fleet_sessions.csv")
-    pictures = {
-        "lanes": lanes(ranking),
-        "growth": growth(ranking),
-        "merge": merging(fleet),
-        "downloads": downloads(fleet),
+def pictures(tables: Path) -> dict[str, tuple[Path, Figure]]:
+    """Each picture by name, with the table that it is drawn from."""
+    ranking, fleet = tables / "ranking/summary.csv", tables / "fleet/sessions.csv"
+    drawn = {
+        "papers_lanes": (ranking, lanes),
+        "papers_growth": (ranking, growth),
+        "papers_merge": (fleet, merging),
+        "papers_downloads": (fleet, downloads),
     }
-    for name, picture in pictures.items():
-        picture.savefig(asked.out / f"papers_{name}.png", dpi=110)
-
-
-if __name__ == "__main__":
-    main()
+    return {name: (table, draw(read(table))) for name, (table, draw) in drawn.items()}

@@ -1,0 +1,323 @@
+"""The figures of README, docs and reports, drawn from the tables that the repository keeps.
+
+    python -m engram_lab.studies.pages keep results    # done studies' tables → lab/reports/tables
+    python -m engram_lab.studies.pages draw            # tables → blocks and pictures of the pages
+    python -m engram_lab.studies.pages release         # fails where a figure is of an older version
+
+A block of a page stands between ``<!-- drawn: NAME -->`` and ``<!-- /drawn -->``. `make test` fails
+where a block or a picture is not what its table gives. A block of an older method or world says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import re
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from engram.errors import InputError
+from engram_lab.intervals import Interval, Resamples, SessionSums, difference
+from engram_lab.studies.evidence import MANIFEST, STUDIES, Manifest, State, read_manifest
+from engram_lab.studies.paper_figures import Row, pictures, pooled, read, sessions_of
+
+# Below the root of a checkout.
+TABLES, PICTURES = "lab/reports/tables", "docs/pictures"
+_BLOCK = re.compile(r"(<!-- drawn: ([\w-]+) -->\n).*?(<!-- /drawn -->)", re.DOTALL)
+# Under this key a picture remembers the table that it was drawn from.
+_SOURCE = "Source"
+
+
+class Figures:
+    """The figures that a program of the laboratory wrote as JSON."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._parts: dict[str, list[dict[str, Any]]] = json.loads(path.read_text(encoding="utf-8"))
+
+    def value(self, part: str, name: str, below: str = "") -> float:
+        """One by its name, or the first of another name below it."""
+        rows = next((some for title, some in self._parts.items() if title.startswith(part)), [])
+        names = [one["name"].strip() for one in rows]
+        if name in names:
+            start = names.index(name)
+            wanted = below or name
+            if wanted in names[start:]:
+                return float(rows[names.index(wanted, start)]["value"])
+        raise InputError(f"{self._path}: no figure {name!r} {below!r} of {part!r}")
+
+
+def real_images(tables: Path) -> Iterator[str]:
+    """What the real clips give, for docs/evidence.md."""
+    found = Figures(tables / "real-images/figures.json")
+    near = "within 0.25 m"
+    revisits = f"EuRoC V1_01, revisits, {near}"
+    colour = f"colour rig at the same instant, {near}"
+    yield from (
+        "| what | set-up | result |",
+        "| --- | --- | --- |",
+        "| odometry drift over 10–50 m | KITTI 06, its first 51 frames, full size | "
+        f"{found.value('odometry', 'translation over 10–50 m segments'):.2f} %, "
+        f"{found.value('odometry', 'rotation'):.3f} °/m |",
+        "| even frames mapped, odd frames localised | the same frames: one drive with itself, an "
+        f"easy test | {found.value('even_odd', 'localised'):.0f} %, median error "
+        f"{found.value('even_odd', 'localised', 'error, median'):.2f} cm |",
+        "| matching over 8.4 m of viewing distance | the same road | "
+        f"{found.value('basin', f'KITTI 06, 8.4 m apart, {near}'):.0f} % {near} |",
+        "| one rig maps, the other localises | KITTI raw 0001, grey and colour | "
+        f"{found.value('cross_rig', colour):.0f} %, median "
+        f"{found.value('cross_rig', colour, 'error, median'):.1f} cm |",
+        "| revisits after more than 10 s | EuRoC V1_01, 85 pairs | "
+        f"{found.value('revisits', revisits):.1f} % {near}, "
+        f"{found.value('revisits', revisits, 'passed but further off'):.0f} further off, median "
+        f"{found.value('revisits', revisits, 'error, median'):.1f} cm |",
+    )
+
+
+def real_images_in_short(tables: Path) -> Iterator[str]:
+    """The same for README."""
+    found = Figures(tables / "real-images/figures.json")
+    near = "within 0.25 m"
+    revisits = f"EuRoC V1_01, revisits, {near}"
+    colour = f"colour rig at the same instant, {near}"
+    yield from (
+        "| on real images | result |",
+        "| --- | --- |",
+        "| KITTI 06, its first 5 s: every other frame mapped, the rest localised (an easy test) | "
+        f"{found.value('even_odd', 'localised'):.0f} %, median error "
+        f"{found.value('even_odd', 'localised', 'error, median'):.2f} cm |",
+        "| EuRoC V1_01, 85 revisits of a room after 10 s and more | "
+        f"{found.value('revisits', revisits):.1f} % {near}, "
+        f"{found.value('revisits', revisits, 'passed but further off'):.0f} further off |",
+        "| KITTI raw 0001: one pair of cameras maps, another localises | "
+        f"{found.value('cross_rig', colour):.0f} %, median error "
+        f"{found.value('cross_rig', colour, 'error, median'):.1f} cm |",
+    )
+
+
+_CAMPAIGNS = ("begbroke", "keble", "oxford")
+_LANED = (("distance", "2"), ("path", "2"), ("recall", "2"), ("distance", "4"), ("path", "4"))
+_LEVEL = "with 90 % intervals over sessions"
+
+
+def _percent(row: Row, column: str) -> str:
+    """A share with its interval, if the row has one."""
+    ends = [row.get(f"{column}{end}", "") for end in ("_low", "_high")]
+    text = f"{100 * float(row[column]):.2f}"
+    return (
+        f"{text} ({' … '.join(f'{100 * float(one):.2f}' for one in ends)})" if all(ends) else text
+    )
+
+
+def ranking(tables: Path) -> Iterator[str]:
+    """[L15]'s P(> 10 m) by policy and lanes, and the route missed."""
+    rows = read(tables / "ranking/summary.csv")
+    yield f"P(> 10 m) and, after the semicolon, route not localised, per cent, {_LEVEL}:"
+    yield ""
+    yield f"| policy, lanes | {' | '.join(f'`{one}`' for one in _CAMPAIGNS)} |"
+    yield f"| --- |{' --- |' * len(_CAMPAIGNS)}"
+    for policy, lanes in (*_LANED, ("oracle", "2")):
+        cells = []
+        for campaign in _CAMPAIGNS:
+            (row,) = [
+                one
+                for one in pooled(rows, campaign)
+                if (one["policy"], one["lanes"], one["map_sessions"]) == (policy, lanes, "")
+            ]
+            missed_share = 100 * float(row["share_not_localised"])
+            cells.append(f"{_percent(row, 'p_gt_10m')}; {missed_share:.2f}")
+        yield f"| `{policy}`, {lanes} | {' | '.join(cells)} |"
+
+
+def _sums(rows: Sequence[Row], drives: Iterable[tuple[str, str]]) -> SessionSums:
+    by_drive = {(one["fold"], one["drive"]): one for one in rows}
+    wanted = [by_drive[one] for one in drives]
+    driven_m = np.array([float(one["driven_m"]) for one in wanted])
+    share = np.array([float(one["share_not_localised"]) for one in wanted])
+    return SessionSums(share * driven_m, driven_m)
+
+
+def _points(rows: Sequence[Row], others: Sequence[Row]) -> str:
+    """Both shares of the drives that both have, and their paired difference in points."""
+    common = {(one["fold"], one["drive"]) for one in others}
+    drives = [key for one in rows if (key := (one["fold"], one["drive"])) in common]
+    a, b = _sums(rows, drives), _sums(others, drives)
+    gap: Interval = Resamples.of(len(drives)).interval(difference(a, b))
+    low, high = (f"{100 * one:+.2f}".replace("-", "−") for one in (gap.low, gap.high))
+    return f"{100 * a.value:.2f}, {100 * b.value:.2f} % ({low} … {high} points)"
+
+
+_HELD_OUT = {
+    "download by hour (`tod`) against everything": ("held out in tod", "held out in copy"),
+    "`budget`, a quarter of the bytes, against everything": (
+        "held out in budget 1/4",
+        "held out in copy",
+    ),
+}
+
+
+def fleet(tables: Path) -> Iterator[str]:
+    """[G16]'s claims against ours: one agent and four groups, downloads for an hour."""
+    sessions, summary = (read(tables / f"fleet/{name}.csv") for name in ("sessions", "summary"))
+    of = {
+        (arm, name): [
+            one
+            for one in summary
+            if (one["arm"], one["experiment"], one["map"]) == (arm, "7", name)
+            and one["fold"] != "all"
+        ]
+        for arm in "AB"
+        for name in ("single", "4 groups")
+    }
+    yield "| [G16] | paper | Γ(distance) | `recall` |"
+    yield "| --- | --- | --- | --- |"
+    for what, column, paper in (
+        ("four groups and merges ÷ one agent, time", "counted_s", "29.4 %"),
+        ("the same, nodes", "nodes", "67.6 %"),
+    ):
+        total = {key: sum(float(one[column]) for one in some) for key, some in of.items()}
+        shares = (100 * total[arm, "4 groups"] / total[arm, "single"] for arm in "AB")
+        yield f"| {what} | {paper} | {' | '.join(f'{one:.1f} %' for one in shares)} |"
+    maps = {"route missed, merged against one agent": ("7", "4 groups", "single", "22.0, 32.0 %")}
+    pairs = {what: ("9", *names, "slightly worse") for what, names in _HELD_OUT.items()}
+    for what, (experiment, first, second, paper) in {**maps, **pairs}.items():
+        cells = (
+            _points(*(sessions_of(sessions, arm, experiment, name) for name in (first, second)))
+            for arm in "AB"
+        )
+        yield f"| {what} | {paper} | {' | '.join(cells)} |"
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A part of a page: its study, and what draws it from the kept tables."""
+
+    study: str
+    draw: Callable[[Path], Iterator[str]]
+
+
+BLOCKS: Mapping[str, Block] = {
+    "real-images": Block("real-images", real_images),
+    "real-images-in-short": Block("real-images", real_images_in_short),
+    "ranking": Block("ranking", ranking),
+    "fleet": Block("fleet", fleet),
+}
+
+
+def kept(tables: Path, study: str) -> Manifest:
+    """The manifest of a study's kept tables."""
+    known = read_manifest(tables / study)
+    if known is None:
+        raise InputError(f"{tables / study}: a page shows this study, and no tables of it are kept")
+    return known
+
+
+def drawn_block(name: str, tables: Path) -> str:
+    """The text of a block, with what it says of its version."""
+    block = BLOCKS.get(name)
+    if block is None:
+        raise InputError(f"no block {name!r} is drawn; those are {', '.join(BLOCKS)}")
+    lines = list(block.draw(tables))
+    known = kept(tables, block.study)
+    if not known.is_current:
+        world = f", world {known.world}" if STUDIES[block.study].town else ""
+        lines += ["", f"*Of method version {known.method}{world}: older than this program.*"]
+    return "\n".join(lines) + "\n"
+
+
+def redrawn(text: str, tables: Path) -> str:
+    """A page with its blocks as the tables have them."""
+    return _BLOCK.sub(
+        lambda found: found[1] + drawn_block(found[2], tables) + found[3],
+        text,
+    )
+
+
+def pages(root: Path) -> dict[Path, list[str]]:
+    """The pages below a checkout that have blocks, with their names."""
+    texts = (root / "README.md", *sorted((root / "docs").glob("*.md")))
+    reports = sorted((root / "lab/reports").glob("*.md"))
+    found = {
+        path: [one[2] for one in _BLOCK.finditer(path.read_text(encoding="utf-8"))]
+        for path in (*texts, *reports)
+    }
+    return {path: names for path, names in found.items() if names}
+
+
+def content_of(table: Path) -> str:
+    """What a picture remembers of its table."""
+    return hashlib.sha256(table.read_bytes()).hexdigest()[:16]
+
+
+def draw(root: Path) -> None:
+    """Writes the blocks and the pictures of a checkout again from its tables."""
+    tables = root / TABLES
+    for path in pages(root):
+        before = path.read_text(encoding="utf-8")
+        after = redrawn(before, tables)
+        if after != before:
+            path.write_text(after, encoding="utf-8")
+    for name, (table, figure) in pictures(tables).items():
+        target = root / PICTURES / f"{name}.png"
+        if source_of(target) != content_of(table):
+            figure.savefig(target, dpi=110, metadata={_SOURCE: content_of(table)})
+
+
+def source_of(picture: Path) -> str:
+    """The table that a picture was drawn from; empty where it does not say."""
+    said = re.search(rb"tEXt" + _SOURCE.encode() + rb"\0([0-9a-f]{16})", picture.read_bytes())
+    return "" if said is None else said[1].decode()
+
+
+def keep(results: Path, root: Path) -> list[str]:
+    """Takes the tables of all studies that are done into the repository; their names."""
+    taken = []
+    for name, study in STUDIES.items():
+        if State.of(name, results) is not State.DONE:
+            continue
+        target = root / TABLES / name
+        target.mkdir(parents=True, exist_ok=True)
+        for table in (*study.tables, MANIFEST):
+            shutil.copyfile(results / name / table, target / table)
+        taken.append(name)
+    return taken
+
+
+def outdated(root: Path) -> Iterator[str]:
+    """What of the pages is of an older method, world or command, for people."""
+    tables = root / TABLES
+    for path, names in pages(root).items():
+        for name in names:
+            known = kept(tables, BLOCKS[name].study)
+            if not known.is_current:
+                where = path.relative_to(root)
+                yield f"{where}: {name} is of method {known.method}, world {known.world}"
+
+
+def main() -> None:
+    """Keeps, draws, or says what is too old to be released."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("keep", "draw", "release"))
+    parser.add_argument("results", type=Path, nargs="?", default=Path("results"))
+    parser.add_argument("--root", type=Path, default=Path())
+    asked = parser.parse_args()
+    if asked.what == "keep":
+        print("\n".join(keep(asked.results, asked.root)) or "no study is done there")
+    if asked.what != "release":
+        draw(asked.root)
+        return
+    if old := list(outdated(asked.root)):
+        sys.exit("\n".join([*old, "run engram lab evaluate all, then pages keep"]))
+
+
+if __name__ == "__main__":
+    main()
