@@ -35,7 +35,7 @@ from .synthetic import (
     write_image,
     write_log,
 )
-from .test_robotcar_tumvi import write_robotcar, write_tumvi
+from .test_public_sets import write_fourseasons, write_robotcar, write_tumvi, write_utias
 
 
 def in_layout(layout: ImageLayout) -> WriteDrive:
@@ -72,11 +72,13 @@ WRITERS: list[tuple[str, WriteDrive]] = [
     *((layout.format, in_layout(layout)) for layout in LAYOUTS.values()),
     ("tum-vi", write_tumvi),
     ("robotcar", write_robotcar),
+    ("utias", write_utias),
+    ("4seasons", write_fourseasons),
     ("bag", write_bag),
     ("framelog", write_framelog),
 ]
 # Their calibration is not one that Engram could write.
-OWN_CAMERAS = {"tum-vi", "robotcar"}
+OWN_CAMERAS = {"tum-vi", "robotcar", "utias"}
 
 
 @pytest.mark.parametrize(("name", "write"), WRITERS)

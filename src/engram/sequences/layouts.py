@@ -1,4 +1,4 @@
-"""Drives stored as images: KITTI, EuRoC, plain folders, Oxford RobotCar.
+"""Drives stored as images: KITTI, EuRoC, plain folders, Oxford RobotCar, UTIAS, 4Seasons.
 
 KITTI odometry and KITTI raw: rectified pairs, paired by frame number. Source: Geiger, Lenz,
 Stiller, Urtasun, "Vision meets Robotics: The KITTI Dataset", IJRR 2013.
@@ -15,6 +15,16 @@ Maddern, Pascoe, Linegar, Newman, "1 Year, 1000km: The Oxford RobotCar Dataset",
 data set's documentation and software kit: `stereo/left|right/MICROSECONDS.png` with pattern GBRG,
 `stereo.timestamps`, models `stereo_wide_left.txt` (fx fy cx cy, then a 4×4 transform) and
 `stereo_wide_left_distortion_lut.bin` (the source u, then v, of each rectified pixel, float64).
+
+UTIAS Long-Term Localization and Mapping (In the Dark, Multiseason): rectified key frames of a run,
+`run_NNNNNN/images/left|right/NNNNNN.png`, and `timestamps_images.txt` with lines `frame,ns`.
+Source: the data set's page and its tools, utiasASRL/vtr-dataset-tools.
+
+4Seasons: `recording_…/undistorted_images/cam0|cam1/NANOSECONDS.png`, rectified, and `calibration/`
+with `undistorted_calib_0|1.txt` ("Pinhole fx fy cx cy …", then width and height) and
+`undistorted_calib_stereo.txt` (4×4). Source: Wenzel et al., "4Seasons: A Cross-Season Dataset for
+Multi-Weather SLAM in Autonomous Driving", GCPR 2020, and the data set's documentation,
+pmwenzel/4seasons-dataset.
 """
 
 from __future__ import annotations
@@ -855,3 +865,155 @@ def _table(path: Path, width: int, height: int) -> RemapTable:
         raise CalibrationError(f"{path}: has a number that is not finite")
     pixels, fractions = cv2.convertMaps(u, v, cv2.CV_16SC2)
     return RemapTable(np.asarray(pixels, np.int16), np.asarray(fractions, np.uint16))
+
+
+# Of images 512 px wide. Source: the data set's `camera_parameters.txt`.
+_UTIAS_FOCAL_PX, _UTIAS_CENTRE_PX, _UTIAS_WIDTH = 387.777, (257.446, 197.718), 512
+_UTIAS_BASELINE_M = 0.239965
+_TORONTO, _TORONTO_LONGITUDE_DEG = "America/Toronto", -79.47
+
+
+def is_utias(path: Path) -> bool:
+    """A run: a folder with `images/left` or `images/right` and `timestamps_images.txt`."""
+    sides = any((path / "images" / side).is_dir() for side in ("left", "right"))
+    return sides and (path / "timestamps_images.txt").is_file()
+
+
+def find_utias(path: Path, options: OpenOptions) -> ImageDrive:
+    """A run of UTIAS In the Dark or Multiseason; the camera is that of the data set's page."""
+    stamps = path / "timestamps_images.txt"
+    sides = [path / "images" / side for side in ("left", "right")]
+    left, right = (numbered_files(side) for side in sides)
+    listed = utias_stamps(stamps)
+
+    def files(side: dict[int, Path], folder: Path) -> Iterator[StampedFile | str]:
+        for number, stamp_ns in listed.items():
+            found = side.get(number, folder / f"{number:06d}.png")
+            missing = None if number in side else f"{found}: missing, {stamps.name} has its stamp"
+            yield StampedFile(stamp_ns, found, missing)
+        for number in sorted(side.keys() - listed.keys()):
+            yield f"{side[number]}: extra image, {stamps.name} has no stamp for it"
+
+    places = pair_by_stamp(
+        files(left, sides[0]), files(right, sides[1]), options.pair_tolerance_ns, (stamps, stamps)
+    )
+    cameras = cameras_of(options, lambda: _utias_cameras(places, path), sides[0], rectified=True)
+    info = SequenceInfo(
+        path.resolve().name,
+        "utias",
+        Clock.UTC,
+        longitude_deg=_TORONTO_LONGITUDE_DEG,
+        zone=_TORONTO,
+    )
+    return ImageDrive(path, info, cameras, places)
+
+
+def utias_stamps(path: Path) -> dict[int, int]:
+    """Stamps of a run's frames by their number, ns, in the order of the file."""
+    stamps_ns: dict[int, int] = {}
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        if not line.strip():
+            continue
+        frame, stamp_ns = (nanoseconds(part.strip()) for part in f"{line},".split(",")[:2])
+        if frame is None or stamp_ns is None or frame in stamps_ns:
+            raise SequenceError(
+                f"{path}: line {number} is not 'frame,stamp_ns' of a frame of its own: "
+                f"{line[:60]!r}"
+            )
+        stamps_ns[frame] = stamp_ns
+    if not stamps_ns:
+        raise SequenceError(f"{path}: holds no stamp")
+    return stamps_ns
+
+
+def _utias_cameras(places: Listing, path: Path) -> Cameras:
+    width, height = _first_size(places, path)
+    scale = width / _UTIAS_WIDTH
+    cx, cy = (scale * one for one in _UTIAS_CENTRE_PX)
+    focal_px = scale * _UTIAS_FOCAL_PX
+    return Cameras(StereoCamera(focal_px, focal_px, cx, cy, _UTIAS_BASELINE_M, width, height))
+
+
+# Of a rectified pair: greatest angle between the cameras, and greatest offset that is no baseline.
+_RECTIFIED_RAD, _RECTIFIED_M = 1e-3, 1e-3
+
+
+def is_fourseasons(path: Path) -> bool:
+    """A recording: a folder with `undistorted_images/cam0` or `cam1`."""
+    return any((path / "undistorted_images" / name).is_dir() for name in ("cam0", "cam1"))
+
+
+def find_fourseasons(path: Path, options: OpenOptions) -> ImageDrive:
+    """A recording of 4Seasons; `calibration/` lies there or one or two folders up."""
+    sides = [path / "undistorted_images" / name for name in ("cam0", "cam1")]
+    left, right = (_named_by_stamp(side) for side in sides)
+    places = pair_by_stamp(left, right, options.pair_tolerance_ns, (sides[0], sides[1]))
+    cameras = cameras_of(options, lambda: _fourseasons_cameras(path), sides[0], rectified=True)
+    info = SequenceInfo(path.resolve().name, "4seasons", Clock.UTC, zone="Europe/Berlin")
+    return ImageDrive(path, info, cameras, places)
+
+
+def _fourseasons_cameras(path: Path) -> Cameras:
+    folder = _fourseasons_calibration(path)
+    sides = [_pinhole(folder / f"undistorted_calib_{number}.txt") for number in (0, 1)]
+    values, sizes = zip(*sides, strict=True)
+    if sizes[0] != sizes[1] or np.abs(values[0] - values[1]).max() > _SAME_INTRINSICS_PX:
+        raise CalibrationError(f"{folder}: the two undistorted cameras differ: they are no pair")
+    stereo = folder / "undistorted_calib_stereo.txt"
+    pose = all_numbers(stereo, 16).reshape(4, 4)
+    try:
+        # Documented as right to left, the files hold left to right: the length is the same.
+        between = SE3.from_matrix(pose)
+    except InputError as error:
+        raise CalibrationError(f"{stereo}: {error}") from error
+    x, y, z = between.translation.tolist()
+    if between.angle_rad > _RECTIFIED_RAD or max(abs(y), abs(z)) > _RECTIFIED_M or x == 0:
+        raise CalibrationError(
+            f"{stereo}: must be a shift along x alone, as of a rectified pair, not by "
+            f"({x:g}, {y:g}, {z:g}) m and {between.angle_rad:.3g} rad"
+        )
+    fx, fy, cx, cy = values[0].tolist()
+    try:
+        return Cameras(StereoCamera(fx, fy, cx, cy, abs(x), *sizes[0]))
+    except CalibrationError as error:
+        raise CalibrationError(f"{folder}: {error}") from error
+
+
+def _fourseasons_calibration(path: Path) -> Path:
+    resolved = path.resolve()
+    for folder in (resolved, *resolved.parents[:2]):
+        for name in ("calibration", "Calibration"):
+            if (folder / name / "undistorted_calib_0.txt").is_file():
+                return folder / name
+    raise CalibrationError(
+        f"{path}: the folder calibration/ with undistorted_calib_0.txt is missing there and in its "
+        "parents; it is a separate file of the data set"
+    )
+
+
+def _pinhole(path: Path) -> tuple[NDArray[np.float64], tuple[int, int]]:
+    """(4,) float64 fx, fy, cx, cy, px, and the size of the image."""
+    lines = [line.split() for line in read_text(path, CalibrationError).splitlines()[:2]]
+    try:
+        (model, *texts), (width, height) = lines
+        values = np.array([float(text) for text in texts])
+        size = _whole(float(width)), _whole(float(height))
+    except ValueError:
+        model, values, size = "", np.empty(0), (0, 0)
+    if model != "Pinhole" or len(values) < 4 or not np.isfinite(values).all() or values[4:].any():
+        raise CalibrationError(
+            f"{path}: must be 'Pinhole fx fy cx cy', without distortion, then width and height"
+        )
+    return values[:4], size
+
+
+def all_numbers(path: Path, count: int) -> NDArray[np.float64]:
+    """(count,) float64: the numbers of a text file, in lines as they come, all finite."""
+    texts = read_text(path, CalibrationError).replace(",", " ").split()
+    try:
+        values = np.array([float(text) for text in texts])
+    except ValueError as error:
+        raise CalibrationError(f"{path}: {error}") from None
+    if len(values) != count or not np.isfinite(values).all():
+        raise CalibrationError(f"{path}: must hold {count} finite numbers, not {len(values)}")
+    return values

@@ -29,16 +29,20 @@ from engram.sequences.layouts import (
     ImageSequence,
     find_euroc,
     find_folder,
+    find_fourseasons,
     find_kitti_odometry,
     find_kitti_raw,
     find_robotcar,
     find_tumvi,
+    find_utias,
     is_euroc,
     is_folder,
+    is_fourseasons,
     is_kitti_odometry,
     is_kitti_raw,
     is_robotcar,
     is_tumvi,
+    is_utias,
 )
 from engram.sequences.sequence import OpenOptions, Rig
 
@@ -123,6 +127,16 @@ SEQUENCES: Mapping[str, SequenceFormat] = MappingProxyType(
             "Oxford RobotCar, stereo/left/ and stereo/right/, models/ there or above",
             is_robotcar,
             open_images(find_robotcar),
+        ),
+        "utias": SequenceFormat(
+            "UTIAS In the Dark or Multiseason, a run with images/left/ and timestamps_images.txt",
+            is_utias,
+            open_images(find_utias),
+        ),
+        "4seasons": SequenceFormat(
+            "4Seasons, undistorted_images/cam0/ and cam1/, calibration/ there or above",
+            is_fourseasons,
+            open_images(find_fourseasons),
         ),
         "bag": SequenceFormat(
             "ROS bag, a file NAME.bag, NAME.mcap or NAME.db3, or a folder of them",

@@ -1,4 +1,4 @@
-"""Readers of Oxford RobotCar and TUM-VI, on small folders in their documented layouts."""
+"""Readers of RobotCar, TUM-VI, UTIAS and 4Seasons, on small folders in their documented layouts."""
 
 from __future__ import annotations
 
@@ -156,3 +156,115 @@ class TestTumVi:
         assert drive.camera.baseline_m == pytest.approx(0.101)
         assert drive.camera.cam_from_rig is not None
         assert drive.camera.cam_from_rig.translation[0] == pytest.approx(0.05)
+
+
+def write_utias(folder: Path, pairs: Sequence[StereoPair] | None = None) -> Path:
+    """A run of key frames whose numbers skip one."""
+    path = folder / "run_000003"
+    lines = []
+    for index, pair in enumerate(pairs or pairs_from(START_US * 1000, 400_000_000)):
+        number = index + (index > 2)
+        for side in ("left", "right"):
+            write_image(path / "images" / side / f"{number:06d}.png", getattr(pair, side))
+        lines.append(f"{number},{pair.stamp_ns}")
+    (path / "timestamps_images.txt").write_text("\n".join(lines) + "\n")
+    return path
+
+
+class TestUtias:
+    def test_frames_have_the_stamps_of_their_numbers(self, tmp_path) -> None:
+        drive = open_drive(write_utias(tmp_path))
+        assert drive.info.format == "utias"
+        assert drive.info.clock is Clock.UTC
+        pairs = list(drive)
+        assert [one.stamp_ns for one in pairs] == [
+            START_US * 1000 + 400_000_000 * k for k in range(PAIRS)
+        ]
+        np.testing.assert_allclose(pairs[4].right, pairs_from(0, 1)[4].right, atol=1)
+
+    def test_the_camera_is_that_of_the_page_at_the_size_of_the_images(self, tmp_path) -> None:
+        camera = open_drive(write_utias(tmp_path)).camera
+        assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+        assert camera.fx == pytest.approx(387.777 * WIDTH / 512)
+        assert camera.baseline_m == 0.239965
+
+    def test_an_image_without_stamp_and_a_stamp_without_image_are_told(self, tmp_path) -> None:
+        path = write_utias(tmp_path)
+        (path / "images" / "left" / "000001.png").unlink()
+        with pytest.raises(SequenceError, match=r"000001\.png: missing"):
+            list(open_drive(path))
+        stamps = path / "timestamps_images.txt"
+        stamps.write_text("".join(stamps.read_text().splitlines(keepends=True)[2:-1]))
+        with pytest.raises(SequenceError, match="extra image"):
+            list(open_drive(path))
+
+    @pytest.mark.parametrize("line", ["0;1", "x,1", "1", "0,1.5", "0,1400000000000000000"])
+    def test_a_line_that_is_not_frame_and_stamp_is_refused(self, tmp_path, line: str) -> None:
+        path = write_utias(tmp_path)
+        stamps = path / "timestamps_images.txt"
+        stamps.write_text(stamps.read_text() + line + "\n")
+        with pytest.raises(SequenceError, match="line 6 is not 'frame,stamp_ns'"):
+            open_drive(path)
+
+
+def write_fourseasons(
+    folder: Path, pairs: Sequence[StereoPair] | None = None, baseline_m: float = -0.1
+) -> Path:
+    """A recording, with its calibration one folder up; both signs of the baseline are met."""
+    path = folder / "recording_2020-10-07_14-47-51"
+    for pair in pairs or pairs_from(START_US * 1000, 33_333_333):
+        for side, name in (("left", "cam0"), ("right", "cam1")):
+            file = path / "undistorted_images" / name / f"{pair.stamp_ns}.png"
+            write_image(file, getattr(pair, side))
+    calibration = folder / "calibration"
+    calibration.mkdir()
+    text = (
+        f"Pinhole 40.0 40.0 23.5 15.5 0.0 0.0 0.0 0.0\n{WIDTH} {HEIGHT}\ncrop\n{WIDTH} {HEIGHT}\n"
+    )
+    for number in (0, 1):
+        (calibration / f"undistorted_calib_{number}.txt").write_text(text)
+    pose = np.eye(4)
+    pose[0, 3] = baseline_m
+    np.savetxt(calibration / "undistorted_calib_stereo.txt", pose)
+    return path
+
+
+class TestFourSeasons:
+    @pytest.mark.parametrize("baseline_m", [-0.1, 0.1])
+    def test_pairs_and_camera(self, tmp_path, baseline_m: float) -> None:
+        drive = open_drive(write_fourseasons(tmp_path, baseline_m=baseline_m))
+        assert drive.info.format == "4seasons"
+        assert (drive.camera.fx, drive.camera.cx, drive.camera.baseline_m) == (40.0, 23.5, 0.1)
+        pairs = list(drive)
+        assert [one.stamp_ns for one in pairs] == [
+            START_US * 1000 + 33_333_333 * k for k in range(PAIRS)
+        ]
+        np.testing.assert_allclose(pairs[2].left, pairs_from(0, 1)[2].left, atol=1)
+
+    def test_a_missing_calibration_is_named(self, tmp_path) -> None:
+        path = write_fourseasons(tmp_path)
+        shutil.rmtree(tmp_path / "calibration")
+        with pytest.raises(CalibrationError, match="it is a separate file of the data set"):
+            open_drive(path)
+
+    @pytest.mark.parametrize(
+        ("name", "text", "said"),
+        [
+            ("undistorted_calib_0.txt", "Pinhole 40 40 23.5", "must be 'Pinhole fx fy cx cy'"),
+            ("undistorted_calib_0.txt", "EquiDistant 40 40 23 15\n48 32", "must be 'Pinhole"),
+            ("undistorted_calib_1.txt", "Pinhole 40 40 23 15 0.1\n48 32", "without distortion"),
+            ("undistorted_calib_1.txt", "Pinhole 41 41 23 15\n48 32", "differ: they are no pair"),
+            ("undistorted_calib_stereo.txt", "1 0 0", "must hold 16 finite numbers, not 3"),
+            ("undistorted_calib_stereo.txt", "1 0 0 x", "could not convert"),
+            (
+                "undistorted_calib_stereo.txt",
+                "1 0 0 .3  0 1 0 .1  0 0 1 0  0 0 0 1",
+                "a shift along x alone",
+            ),
+        ],
+    )
+    def test_a_wrong_calibration_is_refused(self, tmp_path, name, text, said) -> None:
+        path = write_fourseasons(tmp_path)
+        (tmp_path / "calibration" / name).write_text(text)
+        with pytest.raises(CalibrationError, match=said):
+            open_drive(path)
