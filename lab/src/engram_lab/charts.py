@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.viewing.pictures import save, subplots
+from engram.viewing.drawings import save, subplots
 
 Array = NDArray[np.float64]
 

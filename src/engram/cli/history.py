@@ -113,7 +113,7 @@ def diff(
       engram diff town.engram winter head --picture changes.png
     """
     from engram.maps.map import open_map
-    from engram.viewing.pictures import draw_difference
+    from engram.viewing.drawings import draw_difference
 
     with open_map(map_path) as town:
         found = town.diff(before, after)

@@ -101,8 +101,9 @@ def plot(
 ) -> None:
     """Draw a map from above.
 
-    Shows the map frame, in which goals are stored, and the goals. Distances are true nearby; over
-    long distances they drift unless anchors hold them.
+    Shows the map frame, in which goals are stored, the goals, and where each drive started and
+    went. Distances are true nearby; over long distances they drift unless anchors hold them. Parts
+    whose places relative to each other are unknown are drawn apart.
 
     \b
     Examples:
@@ -110,10 +111,11 @@ def plot(
       engram plot town.engram hours.svg --by hour
       engram plot town.engram before.png --at 3 --by robot
     """
-    from engram.viewing.pictures import plot_map
+    from engram.viewing.drawings import plot_map
 
     drawn = plot_map(map_path, out, by.value, at)
-    typer.echo(f"{out}: {counted(drawn, 'node')} by {by.value}")
+    undrawn = f"; {drawn.text()}" if drawn.text() else ""
+    typer.echo(f"{out}: {counted(drawn.nodes, 'node')} by {by.value}{undrawn}")
 
 
 def check(

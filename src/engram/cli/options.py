@@ -334,7 +334,7 @@ def _file(text: str) -> Path:
 
 
 def _picture(text: str) -> Path:
-    from engram.viewing.pictures import check_picture
+    from engram.viewing.drawings import check_picture
 
     check_picture(Path(text))
     return Path(text)

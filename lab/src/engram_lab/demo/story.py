@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from engram.errors import InputError
 from engram.localiser.localisation import Localisation
-from engram.maps.map import Map, open_map
+from engram.maps.map import open_map
 from engram.monitor import QUIET, Monitor
 from engram.robot.mapping import MapReport, map_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_on, summarise
 from engram.sequences.opening import open_drive
-from engram.viewing.pictures import PictureWriter, Track, draw_from_above, save, subplots
+from engram.viewing.drawings import plot_map, save, subplots
+from engram.viewing.pictures import PictureWriter
 from engram_lab.town.campaigns import campaign_named
 from engram_lab.town.session import SimulatedDrive
 from engram_lab.town.simulating import simulate
@@ -114,11 +115,7 @@ def _draw(
     drives: list[SimulatedDrive],
 ) -> None:
     _draw_attempts(results, report.out / "attempts.png")
-    draw_from_above(
-        _experience_tracks(map_path, drives, report.conditions),
-        report.out / "map_from_above.png",
-        "Experiences by the drive that saved them",
-    )
+    plot_map(map_path, report.out / "map_from_above.png")
     shown = _one_place(drives, report.conditions)
     cv2.imwrite(str(report.out / "one_place.png"), shown)
 
@@ -135,30 +132,6 @@ def _draw_attempts(results: dict[str, list[Localisation]], path: Path) -> None:
     axes.set_title("Attempts per frame, last drive")
     axes.legend(fontsize=8)
     save(figure, path)
-
-
-def _experience_tracks(
-    map_path: Path, drives: list[SimulatedDrive], conditions: list[str]
-) -> list[Track]:
-    """Nodes of each session that are connected to the first node, in the map frame."""
-    with Map.open(map_path) as opened:
-        graph = opened.graph
-        tree, places_m = graph.chains_from(0), opened.layout().positions[:, :2]
-        tracks = []
-        for session in opened.sessions.values():
-            number = graph.session_number(session.id)
-            if number is None:  # it localised everywhere, and saved nothing
-                continue
-            nodes = [i for i in np.flatnonzero(graph.sessions == number) if int(i) in tree.row_of]
-            label = next(
-                text
-                for drive, text in zip(drives, conditions, strict=True)
-                if drive.stamp_ns(0) == session.start_ns
-            )
-            apart = int((graph.sessions == number).sum()) - len(nodes)
-            label += f": {len(nodes)} nodes" + (f", {apart} more unconnected" if apart else "")
-            tracks.append(Track(label, places_m[np.array(nodes, int)]))
-    return tracks
 
 
 def _one_place(drives: list[SimulatedDrive], conditions: list[str]) -> NDArray[np.uint8]:

@@ -75,7 +75,7 @@ from engram.places.vocabulary import Vocabulary, default_vocabulary, hash_of
 from engram.places.words import NodeWords
 from engram.robot.inspecting import describe_map
 from engram.sequences.sequence import LoggedFrame
-from engram.viewing.pictures import plot_map
+from engram.viewing.drawings import plot_map
 from engram_lab.synthetic_places import (
     CAMERA,
     DESCRIPTOR,

@@ -40,7 +40,7 @@ from engram.places.recognisers import recogniser_names
 from engram.places.words import NodeWords, vocabulary_or_default
 from engram.robot.localisers import drives_of
 from engram.robot.settings import RobotOptions, Settings
-from engram.viewing.pictures import check_picture
+from engram.viewing.drawings import check_picture
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from engram.counts import counted
 from engram.graph.model import Session
 from engram.maps.map import Map, open_map
 from engram.maps.map_frame import Moves
-from engram.viewing.pictures import Track, draw_panels
+from engram.viewing.drawings import Panel, Track, draw_from_above, save
 
 # Drives listed in the text; JSON has all, segment by segment.
 _SHOWN_DRIVES = 12
@@ -303,8 +303,9 @@ def picture_before_and_after(centre: Path, before: int, path: Path) -> None:
     for at in (before, None):
         with open_map(centre, at) as opened:
             words = f"{counted(len(opened.graph), 'node')}, revision {opened.revision}"
-            panels.append((f"{'before' if at is not None else 'after'}: {words}", _tracks(opened)))
-    draw_panels(panels, path)
+            title = f"{'before' if at is not None else 'after'}: {words}"
+            panels.append(Panel(title, _tracks(opened)))
+    save(draw_from_above(panels), path)
 
 
 def _tracks(opened: Map) -> list[Track]:

@@ -1,0 +1,469 @@
+"""Drawings of maps from above and of drives over their distance, by Matplotlib.
+
+A drawing is one `Figure`. `save` writes it to a file, `as_svg` makes it part of a page, whose
+colours for text and background it takes.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from html import escape
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+
+from engram.counts import counted
+from engram.errors import InputError, extra
+from engram.files import check_output
+from engram.graph.clock import hour_of_day
+from engram.graph.model import NodeId, Session
+from engram.maps.difference import MapDifference
+from engram.maps.map import Map
+from engram.maps.placed import PlacedNodes
+from engram.untrusted import printable
+from engram.viewing.moments import drive_text
+
+# Colours that people with any colour vision tell apart. Source: Okabe and Ito, 2008.
+PALETTE = (
+    "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#8c6bb1", "#7f7f00",
+)  # fmt: skip
+GOOD, BRIDGED, LOST = "#009e73", "#e69f00", "#d55e00"
+_FEW = "0.6"
+# What stands in a drawing for a page's colours of text, of lesser text and of its background.
+_INK, _MUTED, _PAPER = "#010203", "#040506", "#fcfdfe"
+# A legend longer than this hides the map.
+_NAMED = 12
+# So many parts of a map are drawn; the others are counted.
+_PARTS = 6
+# Arrows along a track: so many over the width of the drawing.
+_ARROWS = 10
+_WIDTH_IN = 9.0
+
+
+def matplotlib_for_files() -> ModuleType:
+    """Matplotlib without a window."""
+    with extra("plots", "pictures need Matplotlib"):
+        import matplotlib
+        import matplotlib.figure
+    matplotlib.use("Agg")
+    return matplotlib
+
+
+def subplots(count: int, *, width: float, height: float, rows: int = 1) -> tuple[Any, list[Any]]:
+    """A figure with `count` axes in `rows` rows, of which the last may be shorter.
+
+    Width and height are those of the figure, in inches.
+    """
+    matplotlib_for_files()
+    from matplotlib import pyplot
+
+    columns = -(-count // rows)
+    figure, axes = pyplot.subplots(
+        rows, columns, figsize=(width, height), layout="constrained", squeeze=False
+    )
+    every = list(np.ravel(axes))
+    for unused in every[count:]:
+        unused.remove()
+    return figure, every[:count]
+
+
+def save(figure: Any, path: Path) -> None:
+    """Writes the figure and releases its memory."""
+    from matplotlib import pyplot
+
+    try:
+        figure.savefig(path, dpi=120)
+    except (OSError, ValueError) as error:  # no such folder; an unknown file extension
+        raise InputError(f"the picture {path} cannot be written: {error}") from error
+    finally:
+        pyplot.close(figure)
+
+
+def as_svg(figure: Any, about: str) -> str:
+    """The figure as part of an HTML page, in the page's colours; releases its memory.
+
+    Args:
+        about: what it shows, for those who do not see it.
+    """
+    matplotlib = matplotlib_for_files()
+    from matplotlib import pyplot
+
+    for axes in figure.axes:
+        _in_page_colours(axes)
+    written = io.StringIO()
+    try:
+        with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": about}):
+            figure.savefig(written, format="svg", transparent=True, metadata={"Date": None})
+    finally:
+        pyplot.close(figure)
+    text = written.getvalue()
+    drawn = text[text.index("<svg") :]
+    drawn = re.sub(r"<metadata>.*?</metadata>", "", drawn, count=1, flags=re.DOTALL)
+    drawn = re.sub(r' (?:width|height)="[\d.]+pt"', "", drawn, count=2)
+    for stand_in, colour in ((_INK, "ink"), (_MUTED, "muted"), (_PAPER, "paper")):
+        drawn = drawn.replace(stand_in, f"var(--{colour})")
+    return drawn.replace("<svg ", f'<svg role="img" aria-label="{escape(printable(about))}" ', 1)
+
+
+def _in_page_colours(axes: Any) -> None:
+    axes.tick_params(colors=_MUTED)
+    for text in (axes.title, axes.xaxis.label, axes.yaxis.label):
+        text.set_color(_INK)
+    for spine in axes.spines.values():
+        spine.set_color(_MUTED)
+    legend = axes.get_legend()
+    if legend is not None:
+        legend.get_frame().set(facecolor=_PAPER, edgecolor=_MUTED)
+        for text in legend.get_texts():
+            text.set_color(_INK)
+
+
+def check_picture(path: Path) -> None:
+    """Checks before the work whether a picture can be written to a path."""
+    check_output(path)
+    formats = matplotlib_for_files().figure.Figure().canvas.get_supported_filetypes()
+    ending = path.suffix.removeprefix(".").lower()
+    if ending not in formats:  # Matplotlib would write another file, NAME.png
+        raise InputError(
+            f"the picture {path} cannot be written: .{ending} is not one of {', '.join(formats)}"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Points of one colour in a drawing.
+
+    Attributes:
+        points_m: (N, 2) float64, x and y in the map frame, metres.
+        colour: Matplotlib colour; None for the next of a series.
+        chain: (N,) int64; points of one number are joined by a line, in their order, with arrows
+            in that direction. None: none are.
+        starts: (N,) bool, the points where drives start; None for none.
+    """
+
+    label: str
+    points_m: NDArray[np.float64]
+    colour: str | None = None
+    chain: NDArray[np.int64] | None = None
+    starts: NDArray[np.bool_] | None = None
+
+    def only(self, chosen: NDArray[np.bool_]) -> Track:
+        """The (N,) bool chosen points of it."""
+        return replace(
+            self,
+            points_m=self.points_m[chosen],
+            chain=None if self.chain is None else self.chain[chosen],
+            starts=None if self.starts is None else self.starts[chosen],
+        )
+
+    def lines(self) -> list[NDArray[np.float64]]:
+        """The (K, 2) points of each line, metres in the map frame, K >= 2."""
+        if self.chain is None:
+            return []
+        lines = (self.points_m[self.chain == one] for one in np.unique(self.chain))
+        return [line for line in lines if len(line) > 1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """Tracks that share one frame, with places named in it, x and y in metres."""
+
+    title: str
+    tracks: Sequence[Track]
+    marks: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def draw_from_above(panels: Sequence[Panel]) -> Any:
+    """A figure of panels side by side; a label has the same colour in all of them."""
+    figure, every = subplots(len(panels), width=7 * len(panels), height=6)
+    _fill(every, panels)
+    return figure
+
+
+def draw_parts(panels: Sequence[Panel]) -> Any:
+    """A figure of a map: the first part large, below it the others, each to its own scale."""
+    matplotlib_for_files()
+    from matplotlib import pyplot
+
+    first, *others = panels
+    height_in = min(max(_WIDTH_IN * _slimness(first), 2.6), 6.5) + 0.8
+    if not others:
+        figure, every = subplots(1, width=_WIDTH_IN, height=height_in)
+    else:
+        figure = pyplot.figure(figsize=(_WIDTH_IN, height_in + 2.6), layout="constrained")
+        grid = figure.add_gridspec(2, len(others), height_ratios=[height_in, 2.6])
+        every = [figure.add_subplot(grid[0, :])]
+        every += [figure.add_subplot(grid[1, column]) for column in range(len(others))]
+    _fill(every, panels)
+    return figure
+
+
+def _slimness(panel: Panel) -> float:
+    """Height of what is drawn, as a share of its width."""
+    points = np.concatenate([track.points_m for track in panel.tracks] or [np.zeros((1, 2))])
+    width_m, height_m = np.ptp(points, axis=0) if len(points) else (1.0, 1.0)
+    return float(max(height_m, 1.0) / max(width_m, 1.0))
+
+
+def _fill(every: Sequence[Any], panels: Sequence[Panel]) -> None:
+    names = dict.fromkeys(_series(track) for panel in panels for track in panel.tracks)
+    colours = {name: PALETTE[number % len(PALETTE)] for number, name in enumerate(names)}
+    for number, (axes, panel) in enumerate(zip(every, panels, strict=True)):
+        for track in panel.tracks:
+            _draw_track(axes, track, track.colour or colours[_series(track)])
+        for name, place in panel.marks.items():
+            axes.plot(*place, "*", color=_INK, markersize=9)
+            axes.annotate(
+                _shown(name), place, xytext=(5, 5), textcoords="offset points", fontsize=8,
+                color=_INK,
+            )  # fmt: skip
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.06)
+        axes.set_xlabel("x, m", fontsize=9)
+        if number == 0:
+            axes.set_ylabel("y, m", fontsize=9)
+        axes.tick_params(labelsize=8)
+        axes.set_title(_shown(panel.title), fontsize=10)
+        if panel.tracks and (number == 0 or len(panels) == 2):
+            _add_legend(axes, panel)
+
+
+def _add_legend(axes: Any, panel: Panel) -> None:
+    if any(track.starts is not None and track.starts.any() for track in panel.tracks):
+        axes.plot([], [], "o", color=_MUTED, markerfacecolor=_PAPER, label="start of a drive")
+    axes.legend(fontsize=8, loc="best", framealpha=0.9)
+
+
+def _draw_track(axes: Any, track: Track, colour: str) -> None:
+    lines = track.lines()
+    x, y = track.points_m[:, 0], track.points_m[:, 1]
+    axes.plot(x, y, ".", color=colour, markersize=3 if lines else 5)
+    axes.plot([], [], "-" if lines else ".", color=colour, label=_shown(track.label))
+    for line in lines:
+        axes.plot(line[:, 0], line[:, 1], "-", color=colour, linewidth=1.4, alpha=0.8)
+    spacing_m = max(float(np.ptp(track.points_m, axis=0).max(initial=0.0)) / _ARROWS, 1.0)
+    for place, heading_rad in _arrows(lines, spacing_m):
+        marker = (3, 0, float(np.rad2deg(heading_rad)) - 90.0)
+        axes.plot(*place, marker=marker, color=colour, markersize=7, linestyle="none")
+    if track.starts is not None and track.starts.any():
+        axes.plot(
+            x[track.starts], y[track.starts], "o", color=colour, markerfacecolor=_PAPER,
+            markersize=8, markeredgewidth=1.8,
+        )  # fmt: skip
+
+
+def _arrows(
+    lines: Sequence[NDArray[np.float64]], spacing_m: float
+) -> list[tuple[NDArray[np.float64], float]]:
+    """Places, (2,) metres in the map frame, and headings, radians, of arrows along lines."""
+    found = []
+    for line in lines:
+        steps = np.diff(line, axis=0)
+        driven_m = np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))
+        for at_m in np.arange(spacing_m / 2, driven_m[-1], spacing_m):
+            at = int(np.searchsorted(driven_m, at_m))
+            heading_rad = float(np.arctan2(steps[at, 1], steps[at, 0]))
+            found.append(((line[at] + line[at + 1]) / 2, heading_rad))
+    return found
+
+
+def _shown(text: str) -> str:
+    """A text of a stranger's map: without control characters and Matplotlib's formulas."""
+    shown = printable(text).replace("$", r"\$")
+    return f" {shown}" if shown.startswith("_") else shown  # Matplotlib would leave it out
+
+
+def _series(track: Track) -> str:
+    return track.label.split(" (")[0]
+
+
+def _by_session(placed: PlacedNodes, label: Callable[[Session], str]) -> list[str]:
+    labels = [label(session) for session in placed.sessions]
+    return [labels[number] for number in placed.session.tolist()]
+
+
+def _experiences(placed: PlacedNodes) -> list[str]:
+    return _by_session(placed, drive_text)
+
+
+def _hours(placed: PlacedNodes) -> list[str]:
+    # Within a second the hour of a drive is looked up once.
+    seconds = np.stack([placed.session, placed.stamp_ns // 1_000_000_000], axis=1)
+    times, which = np.unique(seconds, axis=0, return_inverse=True)
+    labels = []
+    for session, second in times.tolist():
+        hour = hour_of_day(placed.sessions[session], second * 1_000_000_000)
+        labels.append("hour unknown" if hour is None else f"{int(hour):02d} h")
+    return [labels[at] for at in which.ravel().tolist()]
+
+
+def _revisions(placed: PlacedNodes) -> list[str]:
+    return [f"revision {number:3d}" for number in placed.revision.tolist()]
+
+
+def _robots(placed: PlacedNodes) -> list[str]:
+    return _by_session(placed, lambda session: session.robot)
+
+
+COLOURS: Mapping[str, Callable[[PlacedNodes], list[str]]] = {
+    "experience": _experiences,
+    "hour": _hours,
+    "revision": _revisions,
+    "robot": _robots,
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapParts:
+    """A map from above: its parts, whose places relative to each other are unknown.
+
+    Attributes:
+        panels: the largest parts, one panel each.
+        nodes: in all of them.
+        undrawn: parts that are not drawn, and their nodes.
+        part: (N,) int64 of each placed node, 0 the largest part.
+        positions_m: (N, 2) float64, x and y in the map frame, metres.
+    """
+
+    panels: list[Panel]
+    nodes: int
+    undrawn: tuple[int, int]
+    part: NDArray[np.int64]
+    positions_m: NDArray[np.float64]
+
+    def text(self) -> str:
+        """What the drawing leaves out; "" if nothing."""
+        parts, nodes = self.undrawn
+        if not parts:
+            return ""
+        return f"{counted(parts, 'smaller part')} ({counted(nodes, 'node')}) not drawn"
+
+
+def parts_of(opened: Map, by: str = "experience", title: str = "") -> MapParts:
+    """What is drawn of a map.
+
+    Args:
+        by: key of `COLOURS`.
+        title: of the drawing.
+    """
+    placed, graph = opened.placed(), opened.graph
+    at = np.array([graph.index(NodeId(UUID(bytes=one.tobytes()))) for one in placed.uuids], int)
+    part = _by_size(graph.components()[at])
+    points, labels = placed.positions[:, :2], np.array(COLOURS[by](placed), dtype=str)
+    whole = Track("", points, None, graph.experiences[at].astype(np.int64), _starts(placed))
+    count = int(part.max(initial=-1)) + 1
+    panels = [
+        Panel(_part_title(title, number, count, int((part == number).sum())), tracks)
+        for number in range(min(count, _PARTS))
+        if (tracks := _tracks(whole, labels, part == number))
+    ]
+    marks: list[dict[str, tuple[float, float]]] = [{} for _ in panels]
+    for name, goal in sorted(opened.goals.items()):
+        of_goal = int(part[np.flatnonzero(at == graph.index(goal.node))[0]])
+        if of_goal < len(panels):
+            place = opened.frame.locate(goal)
+            marks[of_goal][name] = (place.x_m, place.y_m)
+    drawn = [replace(panel, marks=some) for panel, some in zip(panels, marks, strict=True)]
+    undrawn = max(count - _PARTS, 0), int((part >= _PARTS).sum())
+    return MapParts(drawn or [Panel(title, [])], len(part), undrawn, part, points)
+
+
+def _tracks(whole: Track, labels: NDArray[np.str_], chosen: NDArray[np.bool_]) -> list[Track]:
+    """The chosen points, (N,) bool, a track for each of the most frequent labels of all."""
+    tracks = []
+    for label, colour, which in _named(labels):
+        if count := int((which & chosen).sum()):
+            named = f"{label} ({counted(count, 'node')})"
+            tracks.append(replace(whole.only(which & chosen), label=named, colour=colour))
+    return tracks
+
+
+def _by_size(components: NDArray[np.int32]) -> NDArray[np.int64]:
+    """(N,) int64 numbers of (N,) components, the largest 0."""
+    _, which, counts = np.unique(components, return_inverse=True, return_counts=True)
+    rank = np.empty(len(counts), np.int64)
+    rank[np.argsort(-counts, kind="stable")] = np.arange(len(counts))
+    return np.asarray(rank[which.ravel()], np.int64)
+
+
+def _starts(placed: PlacedNodes) -> NDArray[np.bool_]:
+    """(N,) bool: the first node of each drive."""
+    starts = np.zeros(len(placed), np.bool_)
+    order = np.lexsort((placed.stamp_ns, placed.session))
+    _, first = np.unique(placed.session[order], return_index=True)
+    starts[order[first]] = True
+    return starts
+
+
+def _named(labels: NDArray[np.str_]) -> list[tuple[str, str | None, NDArray[np.bool_]]]:
+    """The labels of most points with a colour and their points, and the others together."""
+    counts = Counter(labels.tolist())
+    largest = sorted(label for label, _ in counts.most_common(_NAMED))
+    found: list[tuple[str, str | None, NDArray[np.bool_]]]
+    found = [(label, None, labels == label) for label in largest]
+    if len(counts) > len(largest):
+        rest = ~np.isin(labels, largest)
+        found.append((f"{len(counts) - len(largest)} more", _FEW, rest))
+    return found
+
+
+def _part_title(title: str, number: int, count: int, nodes: int) -> str:
+    if count <= 1:
+        return title
+    size = counted(nodes, "node")
+    if number == 0:
+        return f"{title}: part 1 of {count}, {size}"
+    return f"part {number + 1}: {size}\nrelation unknown"
+
+
+def plot_map(
+    path: Path, out: Path, by: str = "experience", at: int | str | None = None
+) -> MapParts:
+    """Draws a map and its goals from above, in the map frame; returns what was drawn.
+
+    Relative positions are accurate locally; over long distances they drift with odometry, where no
+    anchors hold them.
+
+    Args:
+        by: key of `COLOURS`.
+        at: number or tag of the revision; None for the newest.
+    """
+    check_picture(out)
+    with Map.open(path, at=at) as opened:
+        parts = parts_of(opened, by, f"{path.name}, revision {opened.revision}, by {by}")
+        save(draw_parts(parts.panels), out)
+        return parts
+
+
+def draw_difference(map_path: Path, difference: MapDifference, path: Path) -> None:
+    """Draws the unchanged, added and removed parts between two revisions, in the map frame."""
+    drawn = []
+    for revision, changed in (
+        (difference.after, difference.added),
+        (difference.before, difference.removed),
+    ):
+        with Map.open(map_path, at=revision) as opened:
+            placed = opened.placed()
+            points, ids = placed.positions[:, :2], {node.bytes for node in changed}
+            mask = np.array([uuid.tobytes() in ids for uuid in placed.uuids], bool)
+        drawn += [points[~mask], points[mask]]
+    kept, added, _, removed = drawn
+    tracks = [
+        Track(f"{label}: {counted(len(points), 'node')}", points, colour)
+        for label, points, colour in (
+            ("in both", kept, "0.6"),
+            ("added", added, GOOD),
+            ("removed", removed, LOST),
+        )
+        if len(points)
+    ]
+    title = f"Revision {difference.before} → {difference.after}"
+    save(draw_from_above([Panel(title, tracks)]), path)

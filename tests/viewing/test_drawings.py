@@ -1,0 +1,100 @@
+"""Maps from above: lines in the direction of the drive, starts, parts apart, strangers' names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from tests.builders import write_street
+
+import engram
+from engram.robot.anchors import add_goal
+from engram.sample.drives import write_drives
+from engram.viewing.drawings import Panel, Track, _arrows, as_svg, draw_parts, parts_of, plot_map
+
+HOSTILE = "<script>alert(1)</script> $x$ \x1b[31m -->"
+
+
+@pytest.fixture(scope="module")
+def two_parts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of two streets that nothing joins, the longer one first."""
+    folder = tmp_path_factory.mktemp("parts")
+    town = folder / "town.engram"
+    street = write_street(folder / "street", frames=14)
+    engram.map_drive(town, engram.open_drive(street, robot="r1"))
+    write_drives(folder)
+    other = engram.open_drive(folder / "monday", frames="0:12", robot="<b>r2</b> $x$")
+    engram.map_drive(town, other)
+    return town
+
+
+def test_a_map_is_lines_that_start_somewhere(two_parts: Path) -> None:
+    with engram.open_map(two_parts) as opened:
+        parts = parts_of(opened)
+        nodes = opened.node_count()
+    assert parts.nodes == nodes == len(parts.part)
+    first = parts.panels[0].tracks[0]
+    (line,) = first.lines()
+    np.testing.assert_array_equal(line, first.points_m)
+    assert first.starts is not None
+    assert first.starts.tolist() == [True] + [False] * (len(line) - 1)
+
+
+def test_parts_that_nothing_joins_are_drawn_apart_and_say_so(two_parts: Path) -> None:
+    with engram.open_map(two_parts) as opened:
+        parts = parts_of(opened, title="town")
+    titles = [panel.title for panel in parts.panels]
+    assert titles[0].startswith("town: part 1 of 2, ")
+    assert titles[1].endswith("relation unknown")
+    sizes = [sum(len(track.points_m) for track in panel.tracks) for panel in parts.panels]
+    assert sizes == sorted(sizes, reverse=True)
+    assert parts.undrawn == (0, 0)
+    assert parts.text() == ""
+
+
+def test_parts_beyond_the_sixth_are_counted(two_parts: Path, monkeypatch) -> None:
+    monkeypatch.setattr("engram.viewing.drawings._PARTS", 1)
+    with engram.open_map(two_parts) as opened:
+        parts = parts_of(opened)
+    count = int((parts.part == 1).sum())
+    assert len(parts.panels) == 1
+    assert parts.text() == f"1 smaller part ({count} nodes) not drawn"
+
+
+def test_a_goal_is_drawn_in_its_part(two_parts: Path, tmp_path: Path) -> None:
+    with engram.open_map(two_parts) as opened:
+        parts = parts_of(opened)
+    x, y = (float(value) for value in parts.panels[1].tracks[0].points_m[0])
+    add_goal(two_parts, "dock", x, y, 0.0, author="a")
+    with engram.open_map(two_parts) as opened:
+        marks = [panel.marks for panel in parts_of(opened).panels]
+    assert list(marks[0]) == []
+    assert list(marks[1]) == ["dock"]
+
+
+def test_arrows_point_along_the_line() -> None:
+    there = np.array([[0.0, 0.0], [0.0, 4.0], [-4.0, 4.0]])
+    headings = [np.rad2deg(heading) for _, heading in _arrows([there], 4.0)]
+    assert headings == pytest.approx([90.0, 180.0])
+
+
+def test_a_page_gets_its_own_colours_and_a_text_for_the_blind() -> None:
+    track = Track("a", np.array([[0.0, 0.0], [1.0, 2.0]]), chain=np.zeros(2, np.int64))
+    drawn = as_svg(draw_parts([Panel("a title", [track])]), "a <map> from above")
+    assert 'role="img" aria-label="a &lt;map&gt; from above"' in drawn
+    assert "var(--ink)" in drawn
+    assert "a title" in drawn
+    assert "<?xml" not in drawn
+    assert "http://" not in drawn.replace("http://www.w3.org/", "")
+
+
+def test_names_of_strangers_stay_text(two_parts: Path, tmp_path: Path) -> None:
+    track = Track(HOSTILE, np.zeros((1, 2)))
+    drawn = as_svg(draw_parts([Panel(HOSTILE, [track], {HOSTILE: (0.0, 0.0)})]), HOSTILE)
+    assert "<script" not in drawn
+    assert "\x1b" not in drawn
+    ElementTree.fromstring(drawn)
+    plot_map(two_parts, tmp_path / "town.svg")
+    assert "<b>r2" not in (tmp_path / "town.svg").read_text()
