@@ -44,6 +44,7 @@ EXAMPLES = {
     DOCS / "robot-tutorial.md": "nothing",
     DOCS / "study.md": "nothing",
     DOCS / "data.md": "mapped",
+    DOCS / "datasets.md": "nothing",
     DOCS / "bags.md": "bags",
     DOCS / "calibrations.md": "bags",
     DOCS / "doctor.md": "mapped",

@@ -629,3 +629,42 @@ def everything(
         typer.echo(f"{left / 60:.1f} hours left on two cores")
     if not planned and failed:
         raise EngramError(f"{len(failed)} of the studies failed: {', '.join(failed)}")
+
+
+@evaluate.command("public")
+def public(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="utias, 4seasons, robotcar or kitti.")
+    ],
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Where the data set is on this machine.")
+    ],
+    *,
+    features: Annotated[
+        str, typer.Option("--features", metavar="KIND", help="brief or net.")
+    ] = "brief",
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Logs, maps, page [default: results/NAME]."),
+    ] = None,
+    as_json: options.Json = False,
+) -> None:
+    """Evaluate a public data set; one page comes out.
+
+    Protocol and settings are those of the program: the first drive is mapped, each later one is
+    localised in its map and in one of all drives before. Of KITTI: odometry and loops. The same
+    command resumes. docs/datasets.md says where the sets are.
+
+    \b
+    Examples:
+      engram lab evaluate public utias UTIAS-In-The-Dark
+      engram lab evaluate public kitti dataset --features net
+    """
+    from engram.cli.screen import Bars
+    from engram_lab.studies.public import study_of
+
+    page = study_of(name, folder, out or Path("results") / name, features).run(Bars())
+    if as_json:
+        print(json.dumps({"page": str(page)}))
+    else:
+        typer.echo(f"{page.read_text(encoding='utf-8')}\n{page}")

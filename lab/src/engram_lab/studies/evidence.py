@@ -259,11 +259,11 @@ class Manifest:
     seconds: float = 0.0
 
     @staticmethod
-    def now(name: str) -> Manifest:
-        """Of a study that begins."""
+    def now(name: str, commands: tuple[str, ...] = ()) -> Manifest:
+        """Of a study that begins; without commands it is one of the table."""
         return Manifest(
             name,
-            STUDIES[name].commands,
+            commands or STUDIES[name].commands,
             METHOD_VERSION,
             WORLD_VERSION,
             __version__,
