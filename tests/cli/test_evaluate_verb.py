@@ -48,8 +48,9 @@ def test_a_result_is_judged_where_the_robot_took_itself_to_be(engram, drives, tm
     result.write_text(printed.out)
     found = engram("evaluate", result, "--truth", truth, "--json").json
     assert found["kind"] == "result"
-    assert found["summary"] == printed.json["summary"]
-    share = printed.json["summary"]["share_localised"]
+    summary = printed.json["summary"]
+    assert found["longest_gap_m"] == summary["longest_gap_m"]
+    assert (share := found["share_localised"]) == summary["share_localised"]
     assert (
         f"localised {share:.1%} of the frames" in engram("evaluate", result, "--truth", truth).out
     )
@@ -81,6 +82,11 @@ def test_a_truth_that_does_not_fit_is_refused(engram, drives, tmp_path, content,
     assert says in ran.err
 
 
+SUMMARY = {
+    "frames": 1, "share_localised": 1.0, "statuses": {"localised": 1, "dead_reckoning": 0,
+    "lost": 0}, "driven_m": 1.0, "p_no_match_10m": 0.0, "longest_gap_m": 0.0,
+    "attempts_per_frame": 1.0,
+}  # fmt: skip
 FRAME = {"stamp_ns": 1, "status": "localised", "step_m": 1.0}
 
 
@@ -90,10 +96,10 @@ FRAME = {"stamp_ns": 1, "status": "localised", "step_m": 1.0}
         "{",
         "[1, 2]",
         json.dumps({"frames": []}),
-        json.dumps({"summary": {}, "frames": [{**FRAME, "status": "flying"}]}),
-        json.dumps({"summary": {}, "frames": [{**FRAME, "map_from_live": [1.0]}]}),
-        json.dumps({"summary": {}, "frames": [{**FRAME, "map_from_live": [0.0] * 16}]}),
-        json.dumps({"summary": {}, "frames": [FRAME, FRAME]}),
+        json.dumps({"summary": SUMMARY, "frames": [{**FRAME, "status": "flying"}]}),
+        json.dumps({"summary": SUMMARY, "frames": [{**FRAME, "map_from_live": [1.0]}]}),
+        json.dumps({"summary": SUMMARY, "frames": [{**FRAME, "map_from_live": [0.0] * 16}]}),
+        json.dumps({"summary": SUMMARY, "frames": [FRAME, FRAME]}),
         '{"summary":' + "[" * 100_000,
     ],
 )

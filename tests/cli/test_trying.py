@@ -81,7 +81,8 @@ def test_it_resumes_and_without_extras_names_them(engram, tour: str, monkeypatch
     assert "nothing to do: the map already contains this drive" in ran.out
     assert "pip install 'engram-localisation[plots]'" in ran.out
     assert "pip install 'engram-localisation[view]'" in ran.out
-    assert ran.out.splitlines()[-12:] == tour.splitlines()[-12:]
+    without_page = tour.replace("engram-try/tuesday.html or ", "")
+    assert ran.out.splitlines()[-12:] == without_page.splitlines()[-12:]
     assert not Path("engram-try/map.png").exists()
 
 

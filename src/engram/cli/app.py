@@ -19,7 +19,7 @@ from engram.cli.frame import anchor, export, goal
 from engram.cli.history import diff, log, revert, show, tag
 from engram.cli.maps import amend, check, info, plot, upgrade, view, vocabulary
 from engram.cli.options import ExitStatus, PartlyDoneError, Verb, VerbInterruptedError, spread
-from engram.cli.reports import evaluate
+from engram.cli.reports import evaluate, report
 from engram.cli.screen import UnwritableError, forget, screen
 from engram.cli.showing import features, settings
 from engram.cli.trying import try_
@@ -34,6 +34,7 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
         "map": map_,
         "localise": localise,
         "evaluate": evaluate,
+        "report": report,
         "record": record,
         "live": live,
     },

@@ -146,6 +146,7 @@ def localise(
             "--deadline",
             metavar="MS",
             help="Start no attempt later than this after the frame.",
+            hidden=True,
         ),
     ] = None,
     at: options.At = None,
@@ -167,6 +168,7 @@ def localise(
             parser=options.output_folder,
         ),
     ] = None,
+    report: options.Reported = None,
     rate: Annotated[
         float | None,
         typer.Option(
@@ -221,7 +223,7 @@ def localise(
       engram localise town.engram drives/tuesday --ranking distance --json
       engram localise town.engram drives/tuesday --rate 20 --deadline 40
       engram localise town.engram drives/tuesday --trajectory tuesday.tum --pictures matches
-      engram localise town.engram drives/tuesday --view window
+      engram localise town.engram drives/tuesday --report tuesday.html
       engram localise town.engram drives/tuesday --explain 120
     """
     sequence, given = drive.open(path, settings)
@@ -244,6 +246,7 @@ def localise(
             recorder,
             not no_images,
             view,
+            report,
         )
         with losses_told(sequence), open_map(map_path, at) as opened:
             _follow(opened, resolved)
@@ -253,7 +256,7 @@ def localise(
         return
     refused = {
         "--trajectory": trajectory, "--pictures": pictures, "--rate": rate, "--deadline": deadline,
-        "--remember": remember or None, "--recorder": recorder, "--view": view,
+        "--remember": remember or None, "--recorder": recorder, "--view": view, "--report": report,
     }  # fmt: skip
     for option in (option for option, value in refused.items() if value is not None):
         raise ConfigError(f"--explain is about one frame and takes no {option}")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import typer
 
@@ -18,10 +19,10 @@ if TYPE_CHECKING:
     from engram.robot.explaining import ExplainedCandidate, ExplainOptions, Explanation
     from engram.robot.recorder import Recorder
     from engram.robot.results import ResultRecords
-    from engram.robot.robot import Robot
+    from engram.robot.robot import LastFrame, Robot
     from engram.robot.settings import RobotOptions, Settings
     from engram.sequences.opening import Drive
-    from engram.viewing.pictures import PictureWriter
+    from engram.viewing.report import Showcase
 
 
 # So many match pictures are spread over a drive: enough to leaf through.
@@ -42,6 +43,7 @@ class Outputs:
         recorder: folder of flight records; None for none.
         record_images: whether they hold images.
         view: "window" or a recording to watch it in Rerun; None for neither.
+        report: an HTML page; None for none.
     """
 
     map_path: Path
@@ -54,6 +56,7 @@ class Outputs:
     recorder: Path | None = None
     record_images: bool = True
     view: Path | None = None
+    report: Path | None = None
 
 
 def localise_and_print(
@@ -73,7 +76,6 @@ def localise_and_print(
     from engram.robot.robot import DisplayPose
     from engram.robot.starting import robot_on, summarise
     from engram.sequences.opening import stamps_of
-    from engram.viewing.pictures import PictureWriter
     from engram.viewing.trajectory import write_trajectory
     from engram.viewing.viewer import viewer_for
 
@@ -85,11 +87,8 @@ def localise_and_print(
             viewer.watch(robot, opened)
         robot.recorder = _recorder(opened, sequence, outputs)
         records = ResultRecords(DisplayPose(opened.frame, robot.graph))
-        pictures = None
-        if outputs.pictures is not None:
-            every = max(1, len(sequence) // _PICTURES)
-            pictures = PictureWriter(outputs.pictures, every, opened.frames)
-        results, interrupted = _driven(robot, sequence, outputs.rate_hz, records, pictures)
+        watchers, showcase = _watchers(opened, sequence, robot, outputs)
+        results, interrupted = _driven(robot, sequence, outputs.rate_hz, records, watchers)
         if outputs.trajectory is not None:
             write_trajectory(outputs.trajectory, opened.graph, results)
     fatal = robot.diagnosis.fatal
@@ -111,10 +110,62 @@ def localise_and_print(
     text += [robot.saving.text()] if outputs.remember else []
     places = {"map": str(outputs.map_path), "drive": str(outputs.drive)}
     whole = {**places, "summary": summary, "frames": frames}
+    if outputs.report is not None:
+        _write_report(outputs, whole, opened, showcase)
+        text.append(f"report: {outputs.report}")
     show(whole, "\n".join(text), as_json=outputs.as_json)
     if interrupted:
         raise typer.Exit(ExitStatus.INTERRUPTED)
     untrusted_if(fatal)
+
+
+class Watcher(Protocol):
+    """Looks at each frame of a drive."""
+
+    def see(self, seen: LastFrame, found: Localisation, frame: int, at_m: float) -> None:
+        """Looks at the frame just localised, so many metres into the drive."""
+        ...
+
+
+def _watchers(
+    opened: Map, sequence: Drive, robot: Robot, outputs: Outputs
+) -> tuple[list[Watcher], Showcase | None]:
+    """What draws the drive's matches: for a folder of pictures, and for a report."""
+    from engram.robot.localisers import session_of_drive
+    from engram.viewing.matches import MatchShower, NeighbouringDrives, PictureWriter
+    from engram.viewing.report import Showcase
+
+    watchers: list[Watcher] = []
+    if outputs.pictures is None and outputs.report is None:
+        return watchers, None
+    images = NeighbouringDrives(outputs.drive)
+    shower = MatchShower(opened, robot.graph, session_of_drive(sequence), images)
+    if outputs.pictures is not None:
+        every = max(1, len(sequence) // _PICTURES)
+        watchers.append(PictureWriter(outputs.pictures, every, shower))
+    if outputs.report is None:
+        return watchers, None
+    showcase = Showcase(shower)
+    return [*watchers, showcase], showcase
+
+
+def _write_report(
+    outputs: Outputs, whole: dict[str, Any], opened: Map, showcase: Showcase | None
+) -> None:
+    import msgspec
+
+    from engram.cli.wording import unmatched
+    from engram.robot.results import DriveResult
+    from engram.viewing.report import drive_page, made_by, typed
+
+    assert outputs.report is not None
+    place = outputs.map_path, outputs.drive
+    lines = [typed("engram", "localise", *place, "--report", outputs.report)]
+    if (frame := unmatched(whole["frames"])) is not None:
+        lines.append(typed("engram", "localise", *place, "--explain", frame))
+    lines += [typed("engram", "doctor", outputs.drive), typed("engram", "map", *place)]
+    page = drive_page(msgspec.convert(whole, DriveResult), opened, showcase, lines)
+    page.write(outputs.report, made_by())
 
 
 def _driven(
@@ -122,19 +173,22 @@ def _driven(
     sequence: Drive,
     rate_hz: float | None,
     records: ResultRecords,
-    pictures: PictureWriter | None,
+    watchers: Sequence[Watcher],
 ) -> tuple[list[Localisation], bool]:
     """The results of the drive, and whether Ctrl-C ended it."""
     from engram.cli.screen import Bars
 
     results: list[Localisation] = []
+    at_m = 0.0
     with Bars().stage("localise", len(sequence)) as monitor:
         try:
-            for found in robot.drive(sequence, monitor, rate_hz):
+            for frame, found in enumerate(robot.drive(sequence, monitor, rate_hz)):
                 results.append(found)
                 records.see(found)
-                if pictures is not None and robot.last is not None:
-                    pictures.offer(robot.last, found)
+                at_m += found.motion.moved_m
+                for watcher in watchers:
+                    if robot.last is not None:
+                        watcher.see(robot.last, found, frame, at_m)
         except KeyboardInterrupt:
             typer.echo("interrupted: the summary covers the frames so far", err=True)
             return results, True

@@ -391,6 +391,25 @@ def _view(*, rare: bool = False) -> Any:
     )
 
 
+def _page(text: str) -> Path:
+    from engram.viewing.drawings import matplotlib_for_files
+
+    matplotlib_for_files()  # before the work, not after it
+    if Path(text).suffix not in {".html", ".htm"}:
+        raise InputError(f"{text}: a report is a page, NAME.html")
+    return _file(text)
+
+
+output_page = _refusing(_page)
+Reported: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        "--report",
+        metavar="FILE.html",
+        help="Write a page with map, gaps and matches.",
+        parser=output_page,
+    ),
+]
 View: TypeAlias = Annotated[Path | None, _view()]
 RareView: TypeAlias = Annotated[Path | None, _view(rare=True)]
 Viewed: TypeAlias = Annotated[Path, _view()]

@@ -1,11 +1,11 @@
-"""`engram evaluate`: a drive against its ground truth."""
+"""`engram report`: a page to look at; `engram evaluate`: a drive against its ground truth."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -15,9 +15,117 @@ from engram.cli import options
 
 if TYPE_CHECKING:
     from engram.evaluation import Evaluation
+    from engram.frontend.frame import StereoPair
+    from engram.robot.front import Arrived
+    from engram.robot.results import DriveSummary
     from engram.sequences.motion_files import Trajectory
+    from engram.viewing.page import Page
 
+# Pairs on the page of a drive.
+_PAIRS = 3
 _TRAJECTORIES = frozenset({".tum", ".txt"})
+
+
+def report(
+    path: Annotated[
+        Path,
+        typer.Argument(
+            metavar="WHAT", help="A map, a drive, or a result NAME.json of localise --json."
+        ),
+    ],
+    *,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE.html",
+            help="The page [default: WHAT.html here].",
+            parser=options.output_page,
+        ),
+    ] = None,
+    settings: options.SettingsGiven,
+    as_json: options.Json = False,
+) -> None:
+    """Make a page of a map, a drive or a result.
+
+    One file to look at and to pass on: it needs no network and runs no script. Of a map it shows
+    the map from above, its drives and its history; of a drive what the doctor finds, with stereo
+    pairs; of a result where the drive was localised, by whose nodes, and the gaps. With pictures of
+    the matches: engram localise MAP DRIVE --report FILE.html.
+
+    \b
+    Examples:
+      engram report town.engram
+      engram report drives/monday --out look.html
+      engram report tuesday.json
+    """
+    from engram.viewing.report import made_by
+
+    place = out or Path(f"{path.name.partition('.')[0] or 'report'}.html")
+    if out is None:
+        options.output_page(str(place))
+    if path.suffix == ".json":
+        page = _result_page(path)
+    elif path.suffix == ".engram":
+        page = _map_page(path)
+    else:
+        page = _drive_page(path, settings)
+    page.write(place, made_by())
+    options.show({"report": str(place), "verdict": page.verdict}, f"{place}: {page.verdict}",
+                 as_json=as_json)  # fmt: skip
+
+
+def _result_page(path: Path) -> Page:
+    from contextlib import nullcontext
+
+    from engram.robot.results import read_result
+    from engram.viewing.report import drive_page, map_at_hand, typed
+
+    result = read_result(path)
+    place = result.map or "MAP", result.drive or "DRIVE"
+    with map_at_hand(result.map) or nullcontext() as opened:
+        lines = [typed("engram", "localise", *place, "--report", path.with_suffix(".html").name)]
+        return drive_page(result, opened, None, lines)
+
+
+def _map_page(path: Path) -> Page:
+    from engram.files import map_path
+    from engram.viewing.report import map_page, typed
+
+    town = map_path(str(path))
+    lines = [
+        typed("engram", "plot", town, "map.png"),
+        typed("engram", "check", town),
+        typed("engram", "log", town),
+        f"{typed('engram', 'localise', town)} DRIVE --report drive.html",
+    ]
+    return map_page(town, lines)
+
+
+def _drive_page(path: Path, settings: options.SettingsGiven) -> Page:
+    from engram.cli.screen import Bars
+    from engram.frontend.frame import StereoPair
+    from engram.robot.mapping import examine_drive
+    from engram.viewing.report import examined_page, typed
+
+    changes = [*(settings.changes or ()), "drive.skip_bad=true"]
+    sequence, given = options.Seen().open(path, replace(settings, changes=changes))
+    resolved = given.of_robot()
+    most = min(len(sequence), resolved.doctor.frames)
+    pairs: list[StereoPair] = []
+
+    def keep(number: int, arrived: Arrived) -> None:
+        if number * _PAIRS // max(most, 1) == len(pairs) and isinstance(arrived, StereoPair):
+            pairs.append(arrived)
+
+    with Bars().stage("doctor", most) as monitor:
+        diagnosis = examine_drive(sequence, resolved, monitor, seen=keep)
+    lines = [
+        typed("engram", "doctor", path),
+        typed("engram", "map", "MAP.engram", path),
+        typed("engram", "localise", "MAP.engram", path, "--report", "drive.html"),
+    ]
+    return examined_page(str(path), diagnosis, pairs, lines)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +141,7 @@ class _Driven:
     kind: str
     path: Trajectory
     stamps_ns: NDArray[np.int64]
-    summary: dict[str, Any] | None = None
+    summary: DriveSummary | None = None
 
 
 def evaluate(
@@ -73,7 +181,8 @@ def evaluate(
     found = compare(driven.path, read_truth(truth, driven.stamps_ns))
     plain = {"kind": driven.kind, **found.to_dict()}
     if driven.summary is not None:
-        plain["summary"] = driven.summary
+        plain["share_localised"] = driven.summary.share_localised
+        plain["longest_gap_m"] = driven.summary.longest_gap_m
     options.show(plain, partial(_text, path, driven, found), as_json=as_json)
 
 
@@ -110,7 +219,7 @@ def _text(path: Path, driven: _Driven, found: Evaluation) -> str:
     lines = [f"{path}, {driven.kind}: {found.text()}"]
     if driven.summary is not None:
         lines.append(
-            f"localised {driven.summary['share_localised']:.1%} of the frames, longest stretch "
-            f"without a match {driven.summary['longest_gap_m']:.1f} m"
+            f"localised {driven.summary.share_localised:.1%} of the frames, longest stretch "
+            f"without a match {driven.summary.longest_gap_m:.1f} m"
         )
     return "\n".join(lines)

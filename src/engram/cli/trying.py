@@ -96,7 +96,7 @@ def steps(out: Path) -> Iterator[Step]:
     yield Step("Make a map of it.", ("map", street, monday))
     yield Step(
         "Find the next day's drive in the map.",
-        ("localise", street, tuesday, "--pictures", str(out / "matches")),
+        ("localise", street, tuesday, "--pictures", str(out / "matches"), *_page(out)),
     )
     yield Step(
         "Draw the map from above.",
@@ -109,6 +109,11 @@ def steps(out: Path) -> Iterator[Step]:
         extra=("rerun", "view"),
         runs=False,
     )
+
+
+def _page(out: Path) -> tuple[str, ...]:
+    """The option that makes a page of the drive, where what draws it is installed."""
+    return () if find_spec("matplotlib") is None else ("--report", str(out / "tuesday.html"))
 
 
 def _tour(ctx: typer.Context, out: Path) -> None:
@@ -147,7 +152,8 @@ def _end(out: Path) -> None:
     street = out / "street.engram"
     typer.echo(f"\n{_how_right(offsets_m(street, out))}")
     typer.echo(
-        f"Look at {out / 'matches'}: what a frame shares with the node that it matched. Tuesday's "
+        f"Look at {' or '.join([*_page(out)[1:], str(out / 'matches')])}: what a frame shares "
+        "with the node that it matched. Tuesday's "
         "last 7 m lie beyond Monday's drive.\n\n"
         "Add what Tuesday's drive has seen for the first time:\n"
         f"  {shlex.join(['engram', 'map', str(street), str(out / 'tuesday')])}\n"

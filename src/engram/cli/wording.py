@@ -156,11 +156,16 @@ def _after_localising(
             "if it is the same place in other light or weather, map it, too: engram map "
             f"{typed(map_path)} DRIVE"
         )
+    if (frame := unmatched(frames)) is not None:
+        return f"engram localise {typed(map_path)} DRIVE --explain {frame}"
+    return _shown(map_path)
+
+
+def unmatched(frames: Sequence[Mapping[str, Any]]) -> int | None:
+    """A frame that no node matched, in the middle of all such; None if there is none."""
     missed = [
         number
         for number, frame in enumerate(frames)
         if frame["status"] in {"dead_reckoning", "lost"}
     ]
-    if missed:
-        return f"engram localise {typed(map_path)} DRIVE --explain {missed[len(missed) // 2]}"
-    return _shown(map_path)
+    return missed[len(missed) // 2] if missed else None

@@ -24,7 +24,7 @@ from engram.maps.map import Map
 from engram.maps.map_frame import Moves, moves
 from engram.monitor import QUIET, Monitor
 from engram.repair.finding import Finding, Findings, RepairConfig, find_wrong_edges, part_labels
-from engram.viewing.pictures import match_picture
+from engram.viewing.pictures import match_picture, with_caption
 
 # Rows of pixels of a picture; stored thumbnails are small.
 _HEIGHT_PX = 360
@@ -58,9 +58,11 @@ def _picture(
     enlarged = cv2.resize(b, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
     size = (enlarged.shape[1], enlarged.shape[0])
     pixels_a, pixels_b = _inliers(frames, finding.edge.a, finding.edge.b)
-    return match_picture(
-        a, enlarged.astype(np.uint8), pixels_a, (pixels_b * size).astype(np.float32), finding.text()
+    live_pixels = (pixels_b * size).astype(np.float32)
+    picture = match_picture(
+        a, enlarged.astype(np.uint8), pixels_a, live_pixels, ("one node", "the other")
     )
+    return with_caption(picture, finding.text())
 
 
 def _inliers(

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.doctor.table import Finding
 from engram.errors import InputError
 from engram.geometry.se3 import SE3
 from engram.localiser.localisation import Localisation, LocalisationStatus
@@ -54,18 +55,34 @@ class ResultFrame(msgspec.Struct, frozen=True, kw_only=True):
         return SE3.from_matrix(np.array(self.map_from_live).reshape(4, 4))
 
 
+class DriveSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """What people look at of a drive's summary; see `engram.robot.starting.summarise`."""
+
+    frames: int
+    share_localised: float
+    statuses: dict[str, int]
+    driven_m: float
+    longest_gap_m: float
+    p_no_match_10m: float
+    attempts_per_frame: float
+    withdrawn: int = 0
+    unusable_frames: int = 0
+    stages_ms: dict[str, dict[str, float]] = {}  # Msgspec copies it
+    findings: list[Finding] = []
+    trusted: bool = True
+
+
 class DriveResult(msgspec.Struct, frozen=True, kw_only=True):
     """A localised drive.
 
     Attributes:
         map, drive: the paths as they were typed; empty in files of earlier versions.
-        summary: see `engram.robot.starting.summarise`.
         frames: one per frame, in order.
     """
 
     map: str = ""
     drive: str = ""
-    summary: dict[str, Any]
+    summary: DriveSummary
     frames: list[ResultFrame]
 
     def trajectory(self, name: str = "the result") -> Trajectory:

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
+from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -19,6 +20,7 @@ from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from engram.counts import counted
 from engram.errors import InputError, extra
@@ -246,7 +248,8 @@ def _draw_track(axes: Any, track: Track, colour: str) -> None:
     lines = track.lines()
     x, y = track.points_m[:, 0], track.points_m[:, 1]
     axes.plot(x, y, ".", color=colour, markersize=3 if lines else 5)
-    axes.plot([], [], "-" if lines else ".", color=colour, label=_shown(track.label))
+    if track.label:
+        axes.plot([], [], "-" if lines else ".", color=colour, label=_shown(track.label))
     for line in lines:
         axes.plot(line[:, 0], line[:, 1], "-", color=colour, linewidth=1.4, alpha=0.8)
     spacing_m = max(float(np.ptp(track.points_m, axis=0).max(initial=0.0)) / _ARROWS, 1.0)
@@ -467,3 +470,98 @@ def draw_difference(map_path: Path, difference: MapDifference, path: Path) -> No
     ]
     title = f"Revision {difference.before} → {difference.after}"
     save(draw_from_above([Panel(title, tracks)]), path)
+
+
+# What stands for frames that no node matched, in strips and on maps.
+BY_ODOMETRY, NOWHERE = "by odometry alone", "lost"
+# Stretches without a match that a strip writes the length of, metres.
+_LONG_GAP_M = 10.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """What a robot made of a drive's F frames.
+
+    Attributes:
+        at_m: (F,) float64, distance driven at each frame, metres, not decreasing.
+        names: of each frame the drive whose node it matched, `BY_ODOMETRY` or `NOWHERE`.
+        confidence: (F,) float64, log-odds, NaN where unknown.
+        localised: (F,) bool.
+        places_m: (F, 2) float64, x and y in the map frame, metres; NaN where unknown.
+    """
+
+    at_m: NDArray[np.float64]
+    names: Sequence[str]
+    confidence: NDArray[np.float64]
+    localised: NDArray[np.bool_]
+    places_m: NDArray[np.float64]
+
+    def runs(self) -> list[tuple[str, int, int]]:
+        """Runs of frames of one name: the name, the first and the last frame."""
+        ends = [at for at in range(1, len(self.names)) if self.names[at] != self.names[at - 1]]
+        bounds = [0, *ends, len(self.names)]
+        return [(self.names[a], a, b - 1) for a, b in pairwise(bounds) if b > a]
+
+    def gaps(self) -> list[tuple[float, float]]:
+        """Stretches between matches, from and to, metres, the drive's start and end included."""
+        matched_m = self.at_m[self.localised]
+        marks = [0.0, *matched_m.tolist(), float(self.at_m[-1])] if len(self.at_m) else []
+        return [(a, b) for a, b in pairwise(marks) if b > a]
+
+
+def draw_strip(course: Course) -> Any:
+    """A drive over its distance: which drive's nodes it matched, and how surely."""
+    figure, (band, sure) = subplots(2, width=_WIDTH_IN, height=3.6, rows=2)
+    names = [one for one in dict.fromkeys(course.names) if one not in (BY_ODOMETRY, NOWHERE)]
+    colours = {name: PALETTE[number % len(PALETTE)] for number, name in enumerate(sorted(names))}
+    colours |= {BY_ODOMETRY: "0.75", NOWHERE: LOST}
+    shown = set[str]()
+    for name, first, last in course.runs():
+        start_m = float(course.at_m[first - 1]) if first else 0.0
+        width_m = max(float(course.at_m[last]) - start_m, 1e-3)
+        label = None if name in shown else _shown(name)
+        band.broken_barh([(start_m, width_m)], (0, 1), color=colours[name], label=label)
+        shown.add(name)
+    for start_m, end_m in course.gaps():
+        if end_m - start_m >= _LONG_GAP_M:
+            middle_m = (start_m + end_m) / 2
+            band.text(middle_m, 0.5, f"{end_m - start_m:.0f} m", ha="center", va="center",
+                      fontsize=8, color="black")  # fmt: skip
+    band.set_yticks([])
+    band.set_title("Whose nodes each frame matched", fontsize=10)
+    if shown:
+        columns = min(len(shown), 3)
+        band.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=columns)
+    for name, colour in colours.items():
+        chosen = np.array([one == name for one in course.names], bool)
+        chosen &= np.isfinite(course.confidence)
+        sure.plot(course.at_m[chosen], course.confidence[chosen], ".", color=colour, markersize=4)
+    sure.set_title("Confidence of the best attempt, log-odds", fontsize=10)
+    sure.set_xlabel("distance driven, m", fontsize=9)
+    end_m = float(course.at_m[-1]) if len(course.at_m) else 1.0
+    for axes in (band, sure):
+        axes.set_xlim(0.0, max(end_m, 1e-3))
+        axes.tick_params(labelsize=8)
+    return figure
+
+
+def draw_course(parts: MapParts, course: Course) -> Any:
+    """A map from above in grey, and over it where a drive was localised."""
+    known = np.asarray(np.isfinite(course.places_m).all(axis=1), bool)
+    of = np.full(len(known), -1, np.int64)
+    if len(parts.part) and known.any():
+        _, nearest = cKDTree(parts.positions_m).query(course.places_m[known])
+        of[known] = parts.part[nearest]
+    panels = []
+    for number, panel in enumerate(parts.panels):
+        grey = [replace(track, label="", colour=_FEW) for track in panel.tracks]
+        driven = [
+            Track(label, course.places_m[chosen], colour)
+            for label, colour, which in (
+                ("localised", GOOD, course.localised),
+                ("not localised", LOST, ~course.localised),
+            )
+            if np.any(chosen := np.asarray(which & (of == number), bool))
+        ]
+        panels.append(replace(panel, tracks=[*grey, *driven]))
+    return draw_parts(panels)

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import textwrap
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from engram.doctor.examination import align
-from engram.errors import InputError
 from engram.frontend.features import match_sides
-from engram.frontend.frame import Frame, StereoPair
-from engram.localiser.attempts import Outcome, outcome_at
-from engram.localiser.localisation import Localisation
-from engram.maps.frame_reader import FrameReader
-from engram.robot.robot import LastFrame
+from engram.frontend.frame import StereoPair
 
 Image = NDArray[np.uint8]
 
 _MATCH_GAP_PX = 8
-_MATCH_CAPTION_PX = 28
+# Height of a line of text, and width of a wide letter.
+_LINE_PX, _LETTER_PX = 20, 9
 # Lines over everything hide the images: this many show how they lie to each other.
 _MATCH_LINES = 12
 # Images that are wider than this times their height lie one above the other.
@@ -33,22 +29,24 @@ def match_picture(
     live_image: Image,
     node_pixels: NDArray[np.float32],
     live_pixels: NDArray[np.float32],
-    caption: str,
+    names: tuple[str, str],
 ) -> Image:
-    """Node and live image, named, in the live image's size; wide ones one above the other.
+    """Node and live image, named, in the larger one's size; wide ones one above the other.
 
     Args:
-        node_image: (h, w) uint8 grey, any size; enlarged to that of the live image.
-        live_image: (H, W) uint8 grey.
+        node_image, live_image: (h, w) and (H, W) uint8 grey; the smaller one is enlarged.
         node_pixels: (K, 2) float32, positions in the node's image as fractions of its width and
             height.
         live_pixels: (K, 2) float32, positions in the live image, px.
+        names: of the two images.
 
     Returns:
         (H', W', 3) uint8 BGR.
     """
-    height, width = live_image.shape
-    enlarged = cv2.resize(node_image, (width, height), interpolation=cv2.INTER_CUBIC)
+    scale = max(1.0, node_image.shape[1] / live_image.shape[1])
+    height, width = (round(scale * side) for side in live_image.shape)
+    enlarged, live_image = (_resized(one, width, height) for one in (node_image, live_image))
+    live_pixels = (live_pixels * scale).astype(np.float32)
     stacked = width > _WIDE * height
     shift = np.array([0, height + _MATCH_GAP_PX] if stacked else [width + _MATCH_GAP_PX, 0])
     canvas = np.zeros((*(np.array([height, width]) + shift[::-1]), 3), dtype=np.uint8)
@@ -63,11 +61,31 @@ def match_picture(
         colour = _colour(float(live[1]) / height)
         for centre in (start, end):
             cv2.circle(canvas, tuple(centre), 2, colour, -1, cv2.LINE_AA)
-    _write_name(canvas, "node", np.array([0, 0]))
-    _write_name(canvas, "live", shift)
-    below = np.zeros((_MATCH_CAPTION_PX, canvas.shape[1], 3), dtype=np.uint8)
-    _write(below, caption, (6, _MATCH_CAPTION_PX - 9))
-    return np.concatenate([canvas, below])
+    _write_name(canvas, names[0], np.array([0, 0]))
+    _write_name(canvas, names[1], shift)
+    return canvas
+
+
+def with_caption(picture: Image, caption: str) -> Image:
+    """A picture, (h, w, 3) uint8 BGR, above lines of text."""
+    most = max(1, (picture.shape[1] - 12) // _LETTER_PX)
+    lines = textwrap.wrap(_drawable(caption), most) or [""]
+    below = np.zeros((_LINE_PX * len(lines) + 8, picture.shape[1], 3), dtype=np.uint8)
+    for number, line in enumerate(lines, start=1):
+        _write(below, line, (6, _LINE_PX * number - 4))
+    return np.concatenate([picture, below])
+
+
+def _resized(image: Image, width: int, height: int) -> Image:
+    if image.shape == (height, width):
+        return image
+    enlarged = cv2.resize(image, (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.asarray(enlarged, np.uint8)
+
+
+def _drawable(text: str) -> str:
+    """The text in the letters that OpenCV draws."""
+    return text.replace("→", "->").replace("°", " deg").encode("ascii", "replace").decode()
 
 
 def _spread(pixels: NDArray[np.float32]) -> list[int]:
@@ -84,8 +102,9 @@ def _spread(pixels: NDArray[np.float32]) -> list[int]:
 
 def _write_name(canvas: Image, name: str, corner: NDArray[np.int_]) -> None:
     x, y = (int(value) for value in corner)
-    cv2.rectangle(canvas, (x, y), (x + 46, y + 20), (0, 0, 0), -1)
-    _write(canvas, name, (x + 5, y + 15))
+    shown = _drawable(name)
+    cv2.rectangle(canvas, (x, y), (x + 10 + _LETTER_PX * len(shown), y + 20), (0, 0, 0), -1)
+    _write(canvas, shown, (x + 5, y + 15))
 
 
 def _write(canvas: Image, text: str, at: tuple[int, int]) -> None:
@@ -97,64 +116,6 @@ def _colour(fraction: float) -> tuple[int, int, int]:
     hue = np.array([[[int(170 * min(max(fraction, 0.0), 1.0)), 220, 255]]], dtype=np.uint8)
     blue, green, red = cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0]
     return int(blue), int(green), int(red)
-
-
-class PictureWriter:
-    """Writes a picture of the match, or of its absence, at regular intervals.
-
-    Args:
-        every: frames from one picture to the next.
-    """
-
-    def __init__(self, folder: Path, every: int, frames: FrameReader) -> None:
-        self._folder = folder
-        self._every = every
-        self._frames = frames
-        self._count = -1
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{folder}: cannot be created: {error.strerror}") from error
-
-    def offer(self, seen: LastFrame, localisation: Localisation) -> None:
-        """Writes a picture of the frame just localised, if it is due.
-
-        Args:
-            seen: `Robot.last`.
-        """
-        self._count += 1
-        if self._count % self._every:
-            return
-        image = seen.arrived.left if isinstance(seen.arrived, StereoPair) else seen.frame.thumbnail
-        if image is None:
-            return
-        success = outcome_at(seen.outcomes, localisation.node)
-        status = localisation.status.value
-        if success is None:
-            nothing = np.zeros((0, 2), dtype=np.float32)
-            picture = match_picture(np.zeros_like(image), image, nothing, nothing, status)
-        else:
-            picture = self._match(seen.frame, success, image)
-        path = self._folder / f"{self._count:06d}_{status}.png"
-        if not cv2.imwrite(str(path), picture):
-            raise InputError(f"{path}: the picture cannot be written; is the disk full?")
-
-    def _match(self, live: Frame, success: Outcome, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        node = self._frames.frame(success.candidate.node)
-        thumbnail = self._frames.thumbnail(success.candidate.node)
-        size = np.array([node.camera.width, node.camera.height], dtype=np.float32)
-        scale = image.shape[1] / live.camera.width
-        match = success.match
-        caption = (
-            f"{match.inliers} inliers, rank {success.rank}, node {str(success.candidate.node)[:8]}"
-        )
-        return match_picture(
-            np.zeros((90, 160), dtype=np.uint8) if thumbnail is None else thumbnail,
-            image,
-            node.landmarks.pixels[match.reference_rows] / size,
-            live.landmarks.pixels[match.live_rows] * np.float32(scale),
-            caption,
-        )
 
 
 _SHARED_LINES = 40

@@ -14,12 +14,13 @@ from engram.errors import InputError
 from engram.localiser.localisation import Localisation
 from engram.maps.map import open_map
 from engram.monitor import QUIET, Monitor
+from engram.robot.localisers import session_of_drive
 from engram.robot.mapping import MapReport, map_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_on, summarise
 from engram.sequences.opening import open_drive
 from engram.viewing.drawings import plot_map, save, subplots
-from engram.viewing.pictures import PictureWriter
+from engram.viewing.matches import MatchShower, PictureWriter
 from engram_lab.town.campaigns import campaign_named
 from engram_lab.town.session import SimulatedDrive
 from engram_lab.town.simulating import simulate
@@ -99,12 +100,14 @@ def _localise(
         robot_on(opened, sequence, Settings(), options) as robot,
         monitor.stage(f"localise: {policy}, {most} a frame", len(sequence)) as part,
     ):
-        writer = PictureWriter(out / f"matches_{policy}_{most}", 40, opened.frames)
-        results = []
-        for found in robot.drive(sequence, part):
+        shower = MatchShower(opened, robot.graph, session_of_drive(sequence))
+        writer = PictureWriter(out / f"matches_{policy}_{most}", 40, shower)
+        results, at_m = [], 0.0
+        for frame, found in enumerate(robot.drive(sequence, part)):
             results.append(found)
+            at_m += found.motion.moved_m
             assert robot.last is not None
-            writer.offer(robot.last, found)
+            writer.see(robot.last, found, frame, at_m)
         return results
 
 

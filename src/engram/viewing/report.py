@@ -1,0 +1,352 @@
+"""Reports: a localised drive, a map or a drive as one page that people read first."""
+
+from __future__ import annotations
+
+import shlex
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from uuid import UUID
+
+import numpy as np
+
+from engram import __version__
+from engram.counts import counted
+from engram.doctor.table import Diagnosis, Finding, Severity, measure_text
+from engram.errors import EngramError
+from engram.frontend.frame import StereoPair
+from engram.graph.model import NodeId
+from engram.localiser.localisation import Localisation, LocalisationStatus
+from engram.maps.map import Map
+from engram.robot.inspecting import describe_map, list_sessions
+from engram.robot.results import DriveResult, DriveSummary
+from engram.robot.robot import LastFrame
+from engram.viewing.drawings import (
+    BY_ODOMETRY,
+    NOWHERE,
+    Course,
+    as_svg,
+    draw_course,
+    draw_parts,
+    draw_strip,
+    parts_of,
+)
+from engram.viewing.matches import MatchShower, ShownMatch
+from engram.viewing.moments import drive_text
+from engram.viewing.page import (
+    Page,
+    as_jpeg,
+    commands,
+    drawing,
+    figures,
+    heading,
+    paragraph,
+    photograph,
+    table,
+)
+from engram.viewing.pictures import side_picture
+
+# Pictures of each kind, and the distance between the frames that they show, metres.
+_PICTURES, _APART_M = 3, 8.0
+# Revisions and drives that a page lists.
+_LISTED = 40
+_NO_STATUS = {LocalisationStatus.LOST, LocalisationStatus.DEAD_RECKONING}
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """A match worth showing: how much so, and as a JPEG."""
+
+    score: float
+    shown: ShownMatch
+    jpeg: bytes
+
+
+@dataclass(slots=True)
+class _Shelf:
+    """The few matches of the highest scores that lie apart from each other."""
+
+    kept: list[_Kept] = field(default_factory=list)
+
+    def has_room(self, score: float, at_m: float) -> bool:
+        """Whether a match of this score would be kept."""
+        near = [one.score for one in self.kept if abs(one.shown.at_m - at_m) < _APART_M]
+        if near:
+            return score > max(near)
+        return len(self.kept) < _PICTURES or score > min(one.score for one in self.kept)
+
+    def put(self, score: float, shown: ShownMatch) -> None:
+        """Keeps a match, in place of those near it and beyond the last."""
+        apart = [one for one in self.kept if abs(one.shown.at_m - shown.at_m) >= _APART_M]
+        apart.append(_Kept(score, shown, as_jpeg(shown.picture)))
+        self.kept = sorted(apart, key=lambda one: -one.score)[:_PICTURES]
+
+
+class Showcase:
+    """The best, the weakest and the failed matches of a drive, chosen while it is driven."""
+
+    def __init__(self, shower: MatchShower) -> None:
+        self._shower = shower
+        self.best, self.weakest, self.failed = _Shelf(), _Shelf(), _Shelf()
+
+    def see(self, seen: LastFrame, found: Localisation, frame: int, at_m: float) -> None:
+        """Keeps the frame just localised, if it is one of those."""
+        ranked: list[tuple[_Shelf, float]] = []
+        if found.localised:
+            ranked = [(self.best, float(found.inliers)), (self.weakest, -found.confidence)]
+        elif found.status in _NO_STATUS and found.attempts:
+            ranked = [(self.failed, found.open_loop_m)]
+        wanted = [(shelf, score) for shelf, score in ranked if shelf.has_room(score, at_m)]
+        shown = self._shower.show(seen, found, frame, at_m) if wanted else None
+        if shown is not None:
+            for shelf, score in wanted:
+                shelf.put(score, shown)
+
+    def section(self) -> list[str]:
+        """The part of a page that shows them."""
+        parts = [heading("Matches")]
+        shelves = (
+            ("Best: most inliers", self.best),
+            ("Weakest: least confidence", self.weakest),
+            ("Failed: farthest from a match, with the best attempt", self.failed),
+        )
+        listed = set[int]()
+        for title, shelf in shelves:
+            kept = [one for one in shelf.kept if one.shown.frame not in listed]
+            listed |= {one.shown.frame for one in kept}
+            if kept:
+                parts.append(heading(title, 3))
+            for one in sorted(kept, key=lambda one: one.shown.frame):
+                place = f"frame {one.shown.frame}, {one.shown.at_m:.0f} m into the drive"
+                details = f"{place}; {one.shown.details}"
+                parts.append(photograph(one.jpeg, one.shown.caption, details))
+        if len(parts) == 1:
+            parts.append(paragraph("No picture: the frames have no images, or none was attempted."))
+        else:
+            points = "Points of one colour are one landmark in both; lines join a few of them."
+            parts.insert(1, paragraph(points, "muted"))
+        return parts
+
+
+def drive_page(
+    result: DriveResult, opened: Map | None, showcase: Showcase | None, next_commands: Sequence[str]
+) -> Page:
+    """The page of a localised drive.
+
+    Args:
+        result: what `engram localise --json` prints.
+        opened: its map; None if it is not at hand.
+        showcase: its matches; None without.
+        next_commands: what reproduces it and leads on.
+    """
+    summary, course = result.summary, course_of(result, opened)
+    sections = [figures(_drive_figures(summary))]
+    about = (
+        "Where the drive was localised over its distance: "
+        f"{summary.share_localised:.0%} of the frames, longest gap "
+        f"{summary.longest_gap_m:.1f} m"
+    )
+    sections += [heading("The drive"), drawing(as_svg(draw_strip(course), about), about + ".")]
+    if opened is not None:
+        sections += _map_sections(opened, course)
+    if showcase is not None:
+        sections += showcase.section()
+    alarms = [one for one in summary.findings if one.severity is not Severity.NOTE]
+    sections += finding_section(alarms)
+    sections += [heading("Commands"), commands(next_commands)]
+    return Page(
+        f"{result.drive or 'A drive'} in {result.map or 'a map'}", _verdict(summary), sections
+    )
+
+
+def course_of(result: DriveResult, opened: Map | None) -> Course:
+    """What the robot made of the drive's frames, with names from the map."""
+    names = []
+    for one in result.frames:
+        if one.status is LocalisationStatus.LOCALISED:
+            names.append(_drive_of(one.node, opened))
+        else:
+            lost = one.status is LocalisationStatus.LOST
+            names.append(NOWHERE if lost else BY_ODOMETRY)
+    poses = [one.pose() for one in result.frames]
+    nowhere = np.full(2, np.nan)
+    return Course(
+        result.driven_m(),
+        names,
+        np.array([np.nan if one.confidence is None else one.confidence for one in result.frames]),
+        np.array([one.status is LocalisationStatus.LOCALISED for one in result.frames], bool),
+        np.array([nowhere if pose is None else pose.translation[:2] for pose in poses]).reshape(
+            -1, 2
+        ),
+    )
+
+
+def _drive_of(node: str | None, opened: Map | None) -> str:
+    if opened is not None and node is not None:
+        try:
+            known = NodeId(UUID(node))
+        except ValueError:
+            return "localised"
+        if known in opened.graph:
+            return drive_text(opened.sessions[opened.graph.node(opened.graph.index(known)).session])
+    return "localised"
+
+
+def _verdict(summary: DriveSummary) -> str:
+    words = (
+        f"{summary.statuses.get('localised', 0)} of {counted(summary.frames, 'frame')} localised "
+        f"({summary.share_localised:.1%}) over {summary.driven_m:.0f} m; longest stretch without "
+        f"a match {summary.longest_gap_m:.1f} m."
+    )
+    return words if summary.trusted else f"{words} The drive has a fatal fault: do not trust this."
+
+
+def _drive_figures(summary: DriveSummary) -> list[tuple[str, str]]:
+    total, statuses = summary.stages_ms.get("total", {}), summary.statuses
+    by_odometry, lost = (statuses.get(name, 0) for name in ("dead_reckoning", "lost"))
+    return [
+        ("localised", f"{summary.share_localised:.1%}"),
+        ("driven", f"{summary.driven_m:.0f} m"),
+        ("longest gap", f"{summary.longest_gap_m:.1f} m"),
+        ("route > 10 m from a match", f"{summary.p_no_match_10m:.1%}"),
+        ("attempts per frame", f"{summary.attempts_per_frame:.2f}"),
+        ("frames by odometry, lost", f"{by_odometry}, {lost}"),
+        ("unusable frames", f"{summary.unusable_frames}"),
+        ("fixes withdrawn", f"{summary.withdrawn}"),
+        ("ms a frame, median", f"{total.get('median', 0.0):.1f}"),
+        ("ms a frame, p99", f"{total.get('p99', 0.0):.1f}"),
+    ]
+
+
+def _map_sections(opened: Map, course: Course) -> list[str]:
+    parts = parts_of(opened, title=Path(opened.location).name)
+    about = f"The map from above, {counted(parts.nodes, 'node')}, and where the drive was localised"
+    shown = drawing(as_svg(draw_course(parts, course), about), _map_caption(parts.text()))
+    served = Counter(course.names)
+    rows = [
+        (drive_text(session), opened.session_sizes()[session.id][0], served[drive_text(session)])
+        for session in opened.sessions.values()
+    ]
+    rows.sort(key=lambda row: -row[2])
+    caption = f"Drives of the map, and the frames that matched their nodes{_more(len(rows))}"
+    head = ("drive", "nodes", "frames matched")
+    return [heading("The map"), shown, table(head, rows[:_LISTED], caption)]
+
+
+def _map_caption(undrawn: str) -> str:
+    words = "Grey: the map's drives; arrows: their direction; rings: their starts."
+    return f"{words} {undrawn}." if undrawn else words
+
+
+def _more(rows: int) -> str:
+    return f" (the first {_LISTED} of {rows})" if rows > _LISTED else ""
+
+
+def finding_section(findings: Sequence[Finding]) -> list[str]:
+    """What the doctor found."""
+    rows = [
+        (
+            one.severity,
+            one.code,
+            f"{one.message} ({measure_text(one.value, one.limit, one.unit)})",
+            one.cure,
+        )
+        for one in findings
+    ]
+    parts = [heading("The doctor")]
+    if not rows:
+        return [*parts, paragraph("Nothing wrong with the drive.")]
+    return [*parts, table(("severity", "finding", "what", "cure"), rows, "Findings, worst first")]
+
+
+def map_page(path: Path, next_commands: Sequence[str]) -> Page:
+    """The page of a map."""
+    facts, sessions = describe_map(path), list_sessions(path)
+    with Map.open(path) as opened:
+        parts = parts_of(opened, title=f"{path.name}, revision {opened.revision}")
+        history = [
+            (one.number, f"{datetime.fromtimestamp(one.committed_ns / 1e9, UTC):%Y-%m-%d %H:%M}",
+             one.author, one.message)
+            for one in reversed(opened.log()[-_LISTED:])
+        ]  # fmt: skip
+        named = {str(one.id): drive_text(one) for one in opened.sessions.values()}
+    about = f"{path.name} from above: {counted(parts.nodes, 'node')} by drive"
+    colours = "Colours: drives; arrows: their direction; rings: their starts."
+    caption = f"{colours} {parts.text()}." if parts.text() else colours
+    rows = [
+        (named[one["session"]], one["nodes"], one["path_entries"], one["session"][:8])
+        for one in sessions
+    ]
+    verdict = (
+        f"{counted(facts['nodes'], 'node')} of {counted(facts['sessions'], 'drive')} by "
+        f"{counted(len(facts['robots']), 'robot')}, {facts['mapped_m']:.0f} m mapped; "
+    )
+    verdict += "one connected part." if facts["components"] == 1 else (
+        f"{counted(facts['components'], 'part')} whose places relative to each other are unknown."
+    )  # fmt: skip
+    tiles = [
+        ("nodes", f"{facts['nodes']}"),
+        ("experiences", f"{facts['experiences']}"),
+        ("mapped", f"{facts['mapped_m']:.0f} m"),
+        ("parts", f"{facts['components']}"),
+        ("match attempts", f"{facts['attempts']}"),
+        ("size", f"{facts['size_bytes'] / 1e6:.1f} MB"),
+        ("features", str(facts["descriptor"])),
+        ("revision", f"{facts['revision']}"),
+    ]
+    head = ("drive", "nodes", "path entries", "session")
+    sections = [
+        figures(tiles),
+        heading("From above"),
+        drawing(as_svg(draw_parts(parts.panels), about), caption),
+        heading("Drives"),
+        table(head, rows[:_LISTED], f"Drives in order of arrival{_more(len(rows))}"),
+        heading("History"),
+        table(("revision", "UTC", "by", "reason"), history, "Newest revisions first"),
+        heading("Commands"),
+        commands(next_commands),
+    ]
+    return Page(path.name, verdict, sections)
+
+
+def examined_page(
+    name: str, diagnosis: Diagnosis, pairs: Sequence[StereoPair], next_commands: Sequence[str]
+) -> Page:
+    """The page of a drive that the doctor examined, with a few of its pairs."""
+    fatal = len(diagnosis.fatal)
+    alarms = [one for one in diagnosis.findings if one.severity is not Severity.NOTE]
+    verdict = f"{counted(diagnosis.frames, 'frame')} examined: " + (
+        f"{counted(len(alarms), 'finding')}, {fatal} fatal." if alarms else "nothing wrong."
+    )
+    sections = finding_section(diagnosis.findings)
+    if diagnosis.untold:
+        rows = list(diagnosis.untold.items())
+        sections.append(table(("not checked", "what it would need"), rows, "Checks not made"))
+    if pairs:
+        sections += [heading("Stereo pairs")]
+    for number, pair in enumerate(pairs, start=1):
+        caption = f"Pair {number} of {len(pairs)}: left image above, right image below"
+        details = "Lines join what both sides show: upright and green where sound, red where not."
+        sections.append(photograph(as_jpeg(side_picture(pair)), caption, details))
+    sections += [heading("Commands"), commands(next_commands)]
+    return Page(name, verdict, sections)
+
+
+def made_by() -> str:
+    """The last line of a page."""
+    return f"Made by Engram {__version__}, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC."
+
+
+def typed(*words: object) -> str:
+    """A command as one types it."""
+    return shlex.join(str(word) for word in words)
+
+
+def map_at_hand(path: str) -> Map | None:
+    """The map of a result, open; None if it is not where the result says."""
+    try:
+        return Map.open(Path(path)) if path else None
+    except EngramError:
+        return None
