@@ -233,6 +233,14 @@ def test_an_older_version_is_said_and_is_not_released(checkout: Path, monkeypatc
         assert bool(found) is older
 
 
+def test_what_was_not_measured_is_said_and_is_not_released(checkout: Path) -> None:
+    shutil.rmtree(checkout / pages.TABLES / "budgets", ignore_errors=True)
+    pages.draw(checkout)
+    said = "*Not measured yet: `engram lab evaluate all --only budgets`.*"
+    assert said in (checkout / "docs/ranking.md").read_text()
+    assert "docs/ranking.md: budgets was not measured" in list(pages.outdated(checkout))
+
+
 def test_done_studies_are_kept_with_their_manifest(checkout: Path, tmp_path: Path) -> None:
     results = tmp_path / "results"
     folder = results / "real-images"

@@ -269,6 +269,75 @@ def ranking(
     study.tell(report.files, started)
 
 
+@evaluate.command("budgets")
+@_studying
+def budgets(
+    *,
+    study: _Study,
+    policies: Annotated[
+        str | None,
+        typer.Option(
+            "--policies",
+            metavar="NAME,NAME…",
+            help="Ranking policies [default: distance,path,path-near,recall].",
+        ),
+    ] = None,
+    sizes: Annotated[
+        str | None,
+        typer.Option(
+            "--sizes",
+            metavar="N,N…",
+            help="Drives in the map; all, too [default: 2,5,10,20,40,80].",
+        ),
+    ] = None,
+    attempts: Annotated[
+        str | None,
+        typer.Option("--attempts", metavar="N,N…", help="Attempts a frame [default: 1,2,4,8,16]."),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Folder for the tables.")
+    ] = Path("results/budgets"),
+) -> None:
+    """Show where ranking pays.
+
+    Policies by experiences at a place, attempts a frame, and processor time. Maps save every drive
+    whole. The same command resumes a run that was stopped.
+
+    \b
+    Examples:
+      engram lab evaluate budgets begbroke24h --only-folds 0,1
+      engram lab evaluate budgets hamlet --folds 3 --sizes 2 --attempts 1,4
+    """
+    from engram.cli.screen import Bars
+    from engram.cli.settings import read_settings
+    from engram_lab.studies.budgets import (
+        ATTEMPTS,
+        POLICIES,
+        SIZES,
+        BudgetOptions,
+        saving_everything,
+        write_budgets,
+    )
+    from engram_lab.studies.running import make_plan, run
+
+    started, settings = time.perf_counter(), read_settings(study.config).for_descriptor(None)
+    settings = saving_everything(settings)
+    asked = BudgetOptions(
+        policies=tuple(policies.split(",")) if policies else POLICIES,
+        lanes=numbers(attempts, "--attempts") if attempts else ATTEMPTS,
+        rounds=(1,),
+        folds=study.folds,
+        seed=study.seed,
+        live_folds=0,
+        only_folds=study.chosen_folds,
+        sizes=numbers(sizes, "--sizes") if sizes else SIZES,
+    )
+    plans = [make_plan(one, settings, asked, study.folder) for one in study.drive_sets(settings)]
+    for plan in [] if study.report_only else plans:
+        run(plan, study.workers, Bars())
+    study.tell(write_budgets(out, plans), started)
+
+
 @evaluate.command("fleet")
 @_studying
 def fleet(

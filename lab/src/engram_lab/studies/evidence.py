@@ -121,6 +121,17 @@ STUDIES: Mapping[str, Study] = {
         campaigns=("begbroke24h", "keble", "oxford"),
         resumes=True,
     ),
+    "budgets": Study(
+        (
+            "engram lab simulate begbroke24h",
+            f"{_EVALUATE}budgets begbroke24h --only-folds 0,1 --out {{out}}",
+        ),
+        150,
+        ("sessions.csv", "cells.csv", "times.csv"),
+        ("docs/ranking.md", "docs/papers.md"),
+        campaigns=("begbroke24h",),
+        resumes=True,
+    ),
     "fleet": Study(
         (
             "engram lab simulate begbroke24h",

@@ -99,6 +99,9 @@ class Runs:
         offset_m, turn_rad: (C, F) float32, error of the pose of a success; NaN without one, or
             without truth.
         step_ms: (C,) float64, mean time of a frame; with a memo without the making of new matches.
+        rank_ms: (C,) float64, median time of ranking the candidates of a frame.
+        attempt_ms: (C,) float64, mean processor time of a match that was made; NaN where a memo
+            had them all.
     """
 
     configurations: tuple[Configuration, ...]
@@ -112,6 +115,8 @@ class Runs:
     offset_m: NDArray[np.float32]
     turn_rad: NDArray[np.float32]
     step_ms: NDArray[np.float64]
+    rank_ms: NDArray[np.float64]
+    attempt_ms: NDArray[np.float64]
     in_force: tuple[Values, ...]
 
     @staticmethod
@@ -134,6 +139,8 @@ class Runs:
             offset_m=np.full(shape, np.nan, np.float32),
             turn_rad=np.full(shape, np.nan, np.float32),
             step_ms=np.zeros(shape[0]),
+            rank_ms=np.zeros(shape[0]),
+            attempt_ms=np.full(shape[0], np.nan),
             in_force=tuple(in_force or ({} for _ in configurations)),
         )
 
@@ -205,6 +212,7 @@ def run_in_step(
             step_m,
             [of_localiser(one.localiser, gaps, situation.drive, matcher) for one in running],
         )
+        rank_ms = np.zeros((len(running), len(frames)))
         for number, logged in enumerate(frames):
             if situation.start is None or number < situation.start[0]:
                 for one in running:
@@ -217,8 +225,10 @@ def run_in_step(
                 found = one.robot.step(logged, motion=motions[number])
                 seconds = clock() - started - (cost_so_far() - made)
                 runs.step_ms[row] += 1e3 * seconds
+                rank_ms[row, number] = found.stage_ms.get("rank", 0.0)
                 _note(runs, row, number, found, one.localiser, judge)
     runs.step_ms[:] /= max(len(frames), 1)
+    runs.rank_ms[:] = np.median(rank_ms, axis=1) if frames else 0.0
     return runs
 
 
@@ -313,7 +323,7 @@ def _settings_for(settings: Settings, configuration: Configuration, *, guided: b
     return replace(settings, localiser=localiser)
 
 
-_STORE_VERSION = 3
+_STORE_VERSION = 4
 # What NumPy, zip and JSON say of damaged files.
 UNREADABLE = (
     OSError,

@@ -25,7 +25,8 @@ import numpy as np
 
 from engram.errors import InputError
 from engram_lab.intervals import Interval, Resamples, SessionSums, difference
-from engram_lab.studies.evidence import MANIFEST, STUDIES, Manifest, State, read_manifest
+from engram_lab.studies.budgets import in_short
+from engram_lab.studies.evidence import MANIFEST, STUDIES, State, read_manifest
 from engram_lab.studies.paper_figures import Row, pictures, pooled, read, sessions_of
 
 # Below the root of a checkout.
@@ -207,16 +208,9 @@ BLOCKS: Mapping[str, Block] = {
     "real-images": Block("real-images", real_images),
     "real-images-in-short": Block("real-images", real_images_in_short),
     "ranking": Block("ranking", ranking),
+    "budgets": Block("budgets", lambda tables: in_short(tables / "budgets/cells.csv")),
     "fleet": Block("fleet", fleet),
 }
-
-
-def kept(tables: Path, study: str) -> Manifest:
-    """The manifest of a study's kept tables."""
-    known = read_manifest(tables / study)
-    if known is None:
-        raise InputError(f"{tables / study}: a page shows this study, and no tables of it are kept")
-    return known
 
 
 def drawn_block(name: str, tables: Path) -> str:
@@ -224,8 +218,10 @@ def drawn_block(name: str, tables: Path) -> str:
     block = BLOCKS.get(name)
     if block is None:
         raise InputError(f"no block {name!r} is drawn; those are {', '.join(BLOCKS)}")
+    known = read_manifest(tables / block.study)
+    if known is None:
+        return f"*Not measured yet: `engram lab evaluate all --only {block.study}`.*\n"
     lines = list(block.draw(tables))
-    known = kept(tables, block.study)
     if not known.is_current:
         world = f", world {known.world}" if STUDIES[block.study].town else ""
         lines += ["", f"*Of method version {known.method}{world}: older than this program.*"]
@@ -295,8 +291,10 @@ def outdated(root: Path) -> Iterator[str]:
     tables = root / TABLES
     for path, names in pages(root).items():
         for name in names:
-            known = kept(tables, BLOCKS[name].study)
-            if not known.is_current:
+            known = read_manifest(tables / BLOCKS[name].study)
+            if known is None:
+                yield f"{path.relative_to(root)}: {name} was not measured"
+            elif not known.is_current:
                 where = path.relative_to(root)
                 yield f"{where}: {name} is of method {known.method}, world {known.world}"
 

@@ -36,8 +36,6 @@ from engram_lab.studies.configurations import (
     PathKinds,
     Radius,
     lanes_text,
-    map_sizes,
-    sweep,
 )
 from engram_lab.studies.drives import Fold
 from engram_lab.studies.in_force import (
@@ -265,11 +263,11 @@ def collect(plan: Plan) -> CampaignResult:
     compares configurations on the same sessions. `CampaignResult.left_out` tells of it.
     """
     options = plan.options
-    wanted = set(sweep(*options.swept, plan.settings.localiser))
-    for fold in plan.run_folds:
-        wanted.update(
-            map_sizes(options.policies, options.few_lanes, len(fold.training), options.rounds[0])
-        )
+    wanted = {
+        one
+        for fold in plan.run_folds
+        for one in options.wanted(len(fold.training), plan.settings.localiser)
+    }
     by_mode: dict[str, _Found] = {"memo": {}, "live": {}}
     laps: list[Lap] = []
     maps: list[Values] = []

@@ -10,6 +10,7 @@ from pathlib import Path
 from engram.config import to_dict
 from engram.errors import ConfigError
 from engram.localiser.attempts import Lanes, Matcher
+from engram.localiser.settings import LocaliserConfig
 from engram.maps.map import Map, open_map
 from engram.monitor import QUIET, Monitor
 from engram.ranking.policies import policy_named
@@ -82,8 +83,13 @@ def localise_held_out(
             config.acceptance,
         )
     situation = Situation(opened, drive, frames, start, nodes, truth)
-    cost = (lambda: matcher.seconds) if isinstance(matcher, MatchMemo) else (lambda: 0.0)
-    return run_in_step(situation, configurations, settings, matcher, relocaliser, cost, threads)
+    memo = matcher if isinstance(matcher, MatchMemo) else None
+    cost = (lambda: 0.0) if memo is None else (lambda: memo.seconds)
+    made, before_s = (0, 0.0) if memo is None else (memo.made, memo.seconds)
+    runs = run_in_step(situation, configurations, settings, matcher, relocaliser, cost, threads)
+    if memo is not None and memo.made > made:
+        runs.attempt_ms[:] = 1e3 * (memo.seconds - before_s) / (memo.made - made)
+    return runs
 
 
 # Policies that cannot run without knowing the outcomes.
@@ -119,14 +125,17 @@ class RankingOptions(StudyOptions):
                 raise ConfigError(f"{name} are {values}, must be whole numbers from 1 on")
 
     @property
-    def swept(self) -> tuple[tuple[str, ...], tuple[int, ...], tuple[int, ...]]:
-        """Policies, Np and Nr."""
-        return self.policies, self.lanes, self.rounds
-
-    @property
     def few_lanes(self) -> int:
         """Np of the figures that show one budget: 2 where that is run."""
         return FEW_LANES if FEW_LANES in self.lanes else self.lanes[0]
+
+    def wanted(self, training: int, config: LocaliserConfig) -> tuple[Configuration, ...]:
+        """What is run of a drive, in a map of so many training drives and in earlier ones."""
+        whole = sweep(self.policies, self.lanes, self.rounds, config)
+        if not self.map_sizes:
+            return whole
+        earlier = map_sizes(self.policies, self.few_lanes, training, self.rounds[0])
+        return (*whole, *earlier)
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,15 +226,10 @@ def _run_session(plan: Plan, fold: Fold, session: int) -> None:
     drive = plan.drives.drives[session]
     path = plan.runs_path(session, "memo")
     done = read_runs(path)
-    options = plan.options
-    whole = missing(done, sweep(*options.swept, plan.settings.localiser))
-    earlier: list[Configuration] = []
-    if options.map_sizes:
-        wanted = map_sizes(
-            options.policies, options.few_lanes, len(fold.training), options.rounds[0]
-        )
-        earlier = missing(done, wanted)
-    if not (whole or earlier):
+    wanted = missing(done, plan.options.wanted(len(fold.training), plan.settings.localiser))
+    # The whole map first: what is matched there, maps of fewer drives need not match again.
+    counts = sorted({one.sessions for one in wanted}, key=lambda count: (count is not None, count))
+    if not wanted:
         return
     built = read_built_map(plan.map_path(fold))
     # The newest map's landmarks: earlier revisions have no others.
@@ -233,17 +237,15 @@ def _run_session(plan: Plan, fold: Fold, session: int) -> None:
         memo = MatchMemo.of(newest, drive, plan.settings, plan.work)
         frames = drive.frames()
         run_one = partial(_run_in, plan, fold, session, frames, memo)
-        if whole:
-            done = joined(done, run_one(newest, whole))
-            memo.save()
-            write_runs(path, done)
-        for count in sorted({one.sessions for one in earlier if one.sessions is not None}):
-            some = [one for one in earlier if one.sessions == count]
-            opened = _earlier_maps.open(built.path, built.revision_after(count))
+        for count in counts:
+            some = [one for one in wanted if one.sessions == count]
+            opened = newest
+            if count is not None:
+                opened = _earlier_maps.open(built.path, built.revision_after(count))
             done = joined(done, run_one(opened, some))
-        if earlier and done is not None:
-            memo.save()
-            write_runs(path, done)
+            if count in (None, counts[-1]):
+                memo.save()
+                write_runs(path, done)
 
 
 # Their landmarks are hardly ever read: the memo asks the newest map.
