@@ -191,6 +191,23 @@ def test_blocks_of_a_page_are_as_their_tables_have_them(page: Path) -> None:
     )
 
 
+def test_a_page_shows_the_studies_that_name_it_drawn_or_by_hand() -> None:
+    shown: dict[str, set[str]] = {}
+    for page, names in pages.pages(ROOT).items():
+        shown.setdefault(str(page.relative_to(ROOT)), set()).update(
+            pages.BLOCKS[name].study for name in names
+        )
+    for page, studies in pages.by_hand(ROOT).items():
+        assert set(studies) <= set(STUDIES), page
+        shown.setdefault(str(page.relative_to(ROOT)), set()).update(studies)
+    wanted: dict[str, set[str]] = {}
+    for name, study in STUDIES.items():
+        for page in study.pages:
+            if not page.startswith("lab/"):
+                wanted.setdefault(page, set()).add(name)
+    assert shown == wanted
+
+
 def test_every_block_is_in_a_page() -> None:
     shown = [name for names in pages.pages(ROOT).values() for name in names]
     assert sorted(shown) == sorted(pages.BLOCKS)
@@ -229,8 +246,8 @@ def test_an_older_version_is_said_and_is_not_released(checkout: Path, monkeypatc
         pages.draw(checkout)
         said = f"*Of method version {method}: older than this program.*"
         assert (said in (checkout / "README.md").read_text()) is older
-        found = [line for line in pages.outdated(checkout) if line.startswith("README.md")]
-        assert bool(found) is older
+        found = "\n".join(pages.outdated(checkout))
+        assert ("README.md: real-images-in-short is of method" in found) is older
 
 
 def test_what_was_not_measured_is_said_and_is_not_released(checkout: Path) -> None:
@@ -239,6 +256,14 @@ def test_what_was_not_measured_is_said_and_is_not_released(checkout: Path) -> No
     said = "*Not measured yet: `engram lab evaluate all --only budgets`.*"
     assert said in (checkout / "docs/ranking.md").read_text()
     assert "docs/ranking.md: budgets was not measured" in list(pages.outdated(checkout))
+
+
+def test_figures_by_hand_are_not_released(checkout: Path) -> None:
+    said = "README.md: the figures of robot-needs are copied by hand"
+    assert said in list(pages.outdated(checkout))
+    readme = checkout / "README.md"
+    readme.write_text(readme.read_text().replace("<!-- by hand: robot-needs -->", ""))
+    assert said not in list(pages.outdated(checkout))
 
 
 def test_done_studies_are_kept_with_their_manifest(checkout: Path, tmp_path: Path) -> None:

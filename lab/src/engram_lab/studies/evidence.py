@@ -117,7 +117,7 @@ STUDIES: Mapping[str, Study] = {
         ),
         200,
         ("summary.csv", "sessions.csv"),
-        ("docs/evidence.md", "docs/papers.md", "lab/reports/ranking.md"),
+        ("docs/papers.md", "lab/reports/ranking.md"),
         campaigns=("begbroke24h", "keble", "oxford"),
         resumes=True,
     ),
@@ -128,7 +128,7 @@ STUDIES: Mapping[str, Study] = {
         ),
         150,
         ("sessions.csv", "cells.csv", "times.csv"),
-        ("docs/ranking.md", "docs/papers.md"),
+        ("docs/ranking.md",),
         campaigns=("begbroke24h",),
         resumes=True,
     ),
@@ -154,7 +154,7 @@ STUDIES: Mapping[str, Study] = {
         ),
         45,
         ("summary.csv", "sessions.csv"),
-        ("docs/papers.md",),
+        ("lab/reports/fleet.md",),
         campaigns=("begbroke24h",),
         resumes=True,
     ),
@@ -162,7 +162,7 @@ STUDIES: Mapping[str, Study] = {
         (f"{_EVALUATE}faults --only saving --towns 405,406,407,408 --json",),
         60,
         ("1.txt",),
-        ("docs/evidence.md", "docs/papers.md", "lab/reports/constants.md"),
+        ("docs/evidence.md", "lab/reports/constants.md"),
     ),
     "cameras": Study(
         (
@@ -207,7 +207,7 @@ STUDIES: Mapping[str, Study] = {
         ("python -m engram_lab.fits.confidence --shipped --held-out 405,406,407",),
         60,
         ("1.txt",),
-        ("docs/confidence.md", "lab/reports/trust.md"),
+        ("lab/reports/trust.md",),
     ),
     "repair": Study(
         (
@@ -217,13 +217,13 @@ STUDIES: Mapping[str, Study] = {
         ),
         30,
         ("6.txt",),
-        ("docs/mend.md", "lab/reports/trust.md"),
+        ("lab/reports/trust.md",),
     ),
     "faults": Study(
         (f"{_EVALUATE}faults --trials 1012 --work {{out}}/trials.jsonl --out {{out}}/faults.md",),
         90,
         ("faults.md",),
-        ("docs/doctor.md", "lab/reports/faults.md"),
+        ("lab/reports/faults.md",),
         real=True,
         resumes=True,
     ),
@@ -232,6 +232,25 @@ STUDIES: Mapping[str, Study] = {
         15,
         ("1.txt", "scale.md"),
         ("docs/evidence.md", "lab/reports/performance.md"),
+        town=False,
+    ),
+    "doctor": Study(
+        (f"{_CHECKS}doctor --work {{out}}/trials.jsonl",),
+        60,
+        ("1.txt",),
+        ("lab/reports/doctor.md",),
+        real=True,
+        resumes=True,
+    ),
+    "centre": Study(
+        tuple(
+            f"{_CHECKS}centre_load --agents 50 --nodes {nodes} --minutes 10 "
+            f"--json {{out}}/{nodes}.json"
+            for nodes in (2000, 20000)
+        ),
+        25,
+        ("2000.json", "20000.json"),
+        ("docs/centre.md",),
         town=False,
     ),
     "kills": Study(

@@ -6,6 +6,7 @@
 
 A block of a page stands between ``<!-- drawn: NAME -->`` and ``<!-- /drawn -->``. `make test` fails
 where a block or a picture is not what its table gives. A block of an older method or world says so.
+Figures that are still copied by hand stand below ``<!-- by hand: STUDY, … -->``: `release` fails.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from engram_lab.studies.paper_figures import Row, pictures, pooled, read, sessio
 # Below the root of a checkout.
 TABLES, PICTURES = "lab/reports/tables", "docs/pictures"
 _BLOCK = re.compile(r"(<!-- drawn: ([\w-]+) -->\n).*?(<!-- /drawn -->)", re.DOTALL)
+_BY_HAND = re.compile(r"<!-- by hand: ([\w, -]+?) -->")
 # Under this key a picture remembers the table that it was drawn from.
 _SOURCE = "Source"
 
@@ -247,6 +249,16 @@ def pages(root: Path) -> dict[Path, list[str]]:
     return {path: names for path, names in found.items() if names}
 
 
+def by_hand(root: Path) -> dict[Path, list[str]]:
+    """The studies whose figures a page of README and docs has by hand."""
+    found = {}
+    for path in (root / "README.md", *sorted((root / "docs").glob("*.md"))):
+        marked = _BY_HAND.findall(path.read_text(encoding="utf-8"))
+        if marked:
+            found[path] = [name.strip() for one in marked for name in one.split(",")]
+    return found
+
+
 def content_of(table: Path) -> str:
     """What a picture remembers of its table."""
     return hashlib.sha256(table.read_bytes()).hexdigest()[:16]
@@ -287,8 +299,11 @@ def keep(results: Path, root: Path) -> list[str]:
 
 
 def outdated(root: Path) -> Iterator[str]:
-    """What of the pages is of an older method, world or command, for people."""
+    """What of the pages is by hand, or of an older method, world or command, for people."""
     tables = root / TABLES
+    for path, studies in by_hand(root).items():
+        for study in studies:
+            yield f"{path.relative_to(root)}: the figures of {study} are copied by hand"
     for path, names in pages(root).items():
         for name in names:
             known = read_manifest(tables / BLOCKS[name].study)
