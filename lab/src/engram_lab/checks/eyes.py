@@ -1,6 +1,6 @@
 """What each kind of features recognises: the same places under other lights, and false places.
 
-    python -m engram_lab.checks.eyes --kinds brief,net --out lab/reports/eyes
+    python -m engram_lab.checks.eyes --kinds brief,net --out results/eyes
 
 Matches whole frames, unguided, from rendered towns that no descriptor was trained on and, where
 ENGRAM_DATA names them, of real clips. A match counts if it has the kind's least inliers and its

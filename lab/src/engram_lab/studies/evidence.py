@@ -90,7 +90,7 @@ STUDIES: Mapping[str, Study] = {
         (f"{_CHECKS}robot_needs --json {{out}}/figures.json",),
         5,
         ("figures.json",),
-        ("README.md", "docs/evidence.md"),
+        ("README.md",),
         real=True,
         town=False,
     ),

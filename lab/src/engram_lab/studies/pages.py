@@ -105,6 +105,49 @@ def real_images_in_short(tables: Path) -> Iterator[str]:
     )
 
 
+_PROCESSORS = {
+    "v4": "x86-64 with AVX-512",
+    "v3": "x86-64 with AVX2",
+    "generic": "any x86-64",
+}
+
+
+def robot_needs(tables: Path) -> Iterator[str]:
+    """Processor time of a step."""
+    found = Figures(tables / "robot-needs/figures.json")
+    yield from ("| processor | 512×384 | 1226×370 |", "| --- | --- | --- |")
+    for isa, words in _PROCESSORS.items():
+        times_ms = (
+            found.value(f"{isa}, {size}", "processor time of a step, mean")
+            for size in ("512", "full")
+        )
+        yield f"| {words} | {' | '.join(f'{one:.1f} ms' for one in times_ms)} |"
+
+
+# Conditions, as docs/eyes.md has them.
+_SEEN = ("morning / night", "morning / snow", "rain / rain again")
+
+
+def eyes(tables: Path) -> Iterator[str]:
+    """What each kind recognises, and what it takes to describe."""
+    rows = read(tables / "eyes/eyes.csv")
+
+    def value(kind: str, where: str, what: str) -> Row:
+        wanted = kind, where, what
+        return next(one for one in rows if (one["kind"], one["where"], one["what"]) == wanted)
+
+    visits = "random visits, ≥ 20 inliers"
+    yield f"| kind | {' | '.join(_SEEN)} | look-alikes | 600 corners, AVX-512 |"
+    yield f"| --- |{' --- |' * (len(_SEEN) + 2)}"
+    for kind in ("brief", "net"):
+        seen = [value(kind, "towns 1, 4", what) for what in _SEEN]
+        cells = [f"{one['value']} of {one['of']}" for one in seen]
+        wrong = value(kind, "towns 207, 208", visits)
+        time = value(kind, "v4", "600 corners described, ms added to a frame")
+        cells += [f"{wrong['wrong']} of {wrong['of']}", f"{float(time['value']):.1f} ms"]
+        yield f"| `{kind}` | {' | '.join(cells)} |"
+
+
 _CAMPAIGNS = ("begbroke", "keble", "oxford")
 _LANED = (("distance", "2"), ("path", "2"), ("recall", "2"), ("distance", "4"), ("path", "4"))
 _LEVEL = "with 90 % intervals over sessions"
@@ -209,6 +252,8 @@ class Block:
 BLOCKS: Mapping[str, Block] = {
     "real-images": Block("real-images", real_images),
     "real-images-in-short": Block("real-images", real_images_in_short),
+    "robot-needs": Block("robot-needs", robot_needs),
+    "eyes": Block("eyes", eyes),
     "ranking": Block("ranking", ranking),
     "budgets": Block("budgets", lambda tables: in_short(tables / "budgets/cells.csv")),
     "fleet": Block("fleet", fleet),
