@@ -99,8 +99,10 @@ def test_a_frame_stamped_too_early_is_left_out_and_reported(localiser: Localiser
     robot = Robot(Front(Settings()), localiser)
     for seen in LIVE[:4]:
         robot.step(seen.logged)
+    assert robot.outcomes
     for earlier in (LIVE[3], LIVE[2]):
         left_out = robot.step(earlier.logged)
+        assert robot.outcomes == []
         assert left_out.status is LocalisationStatus.NO_ODOMETRY
         assert left_out.node_from_live is None
     assert robot.step(LIVE[4].logged).localised

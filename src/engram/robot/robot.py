@@ -105,6 +105,7 @@ class Robot:
         # The newest frames, also those where an error came. Replaced, never changed: another
         # thread may ask `pose_at`.
         self.track: tuple[Localisation, ...] = ()
+        self._used = True  # whether the last frame was
         self._closed = False
         self.recorder: Recorder | None = None
         # Called after each step with the frame and its result, such as by a viewer.
@@ -135,8 +136,8 @@ class Robot:
 
     @property
     def outcomes(self) -> list[Outcome]:
-        """Outcomes of the attempts for the last frame, in ranked order."""
-        return self._localiser.outcomes
+        """Outcomes of the attempts for the last frame, in ranked order; none if it was left out."""
+        return self._localiser.outcomes if self._used else []
 
     @property
     def in_force(self) -> InForce:
@@ -202,6 +203,7 @@ class Robot:
         self._front.check(arrived, motion, deadline_ms)
         with deferred_interrupt() as raise_if_asked:
             given, placed = arrived, self._placed(arrived, trusted=trusted)
+            self._used = placed is not None
             if placed is None:
                 raise_if_asked()
                 return self._left_out(arrived, motion)
