@@ -62,6 +62,8 @@ PROOFS = {
     "localiser.lost_after_m": "test_a_robot_relocalises_once_it_drove_as_far_as_is_set",
     "localiser.acceptance.doubt_after": "test_a_robot_that_is_told_a_place_looks_elsewhere_at_once_"
     "only_by_our_default",
+    "mapper.landmarks": "tests.mapper.test_mapper:"
+    "test_a_node_has_more_landmarks_than_the_live_frame",
     "mapper.sure_inliers": "tests.mapper.test_mapper:"
     "test_a_frame_that_matches_weakly_is_saved_unless_as_published",
     "merge.ranking": "test_a_merge_localises_by_the_ranking_and_the_places_of_its_paper",

@@ -14,7 +14,7 @@ localiser: search_radius_m max_search_radius_m view_gate_rad lost_after_m guide_
   guide_below_rad neighbourhood path_entries success fix_sigmas
 localiser.recent: T T_unit iteration_m
 localiser.acceptance: rule min_confidence doubt_after min_inliers min_inliers_lost
-mapper: save_every_m save_every_rad sure_inliers checkpoint_every
+mapper: landmarks save_every_m save_every_rad sure_inliers checkpoint_every
 doctor: frames row_offset_px faulty_share
 drive: format rig channel from_ to skip_bad longitude_deg zone calibration field_of_view_deg
   mask left right motion ranking lanes rounds threads memory relocaliser

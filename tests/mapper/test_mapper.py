@@ -7,9 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.builders import Mapped, World, drive, errors_m, localise_simulated, map_simulated
+from tests.builders import (
+    Mapped,
+    Seen,
+    World,
+    drive,
+    errors_m,
+    localise_simulated,
+    map_simulated,
+)
 
-from engram.frontend.frame import FrameStatus
+from engram.frontend.frame import FrameStatus, Landmarks
 from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, PathEntryKind
@@ -251,3 +259,29 @@ def test_a_kidnapped_robot_is_found_again(first: Mapped, path: Path) -> None:
     found = localise_simulated(path, here + there)
     assert all(one.node is not None for one in found[-10:])
     assert errors_m(found, here + there, first.saved).max() < 0.5
+
+
+def with_more(seen: Seen, own: int) -> Seen:
+    """The step with the first `own` landmarks of its frame, which has the others further."""
+    whole = seen.frame
+
+    def further(count: int) -> Landmarks:
+        return whole.landmarks.rows(slice(own, count))
+
+    return dataclasses.replace(seen, frame=dataclasses.replace(whole.first(own), further=further))
+
+
+# Of 512 × 384 px; the camera has 1.56 times as many pixels.
+@pytest.mark.parametrize(("landmarks", "expected"), [(0, 250), (200, 261)])
+def test_a_node_has_more_landmarks_than_the_live_frame(
+    landmarks: int, expected: int, path: Path
+) -> None:
+    steps = [with_more(seen, 250) for seen in drive(WORLD, ROAD[:20])]
+    map_simulated(path, steps, settings=Settings(mapper=MapperConfig(landmarks=landmarks)))
+    with Map.open(path) as store:
+        nodes = [store.frames.frame(node.id) for node in store.graph.nodes]
+    live = {seen.frame.stamp_ns: seen.frame.landmarks.descriptors for seen in steps}
+    assert len(nodes) >= 10
+    for node in nodes:
+        assert len(node.landmarks) == expected
+        np.testing.assert_array_equal(node.landmarks.descriptors[:250], live[node.stamp_ns])

@@ -297,7 +297,8 @@ def record(
     resolved = given.of_robot(features)
     with losses_told(sequence):
         with Bars().stage("record", len(sequence)) as monitor:
-            report = extract_log(sequence, out, resolved, monitor)
+            most = resolved.mapper.landmarks_for(sequence.camera)
+            report = extract_log(sequence, out, resolved, monitor, most)
         options.show(report, as_json=as_json)
         if report.interrupted:
             raise typer.Exit(ExitStatus.INTERRUPTED)

@@ -121,6 +121,21 @@ class Keypoints:
     candidates: int
     descriptors: NDArray[np.uint8] | None = None
 
+    def rows(self, chosen: NDArray[np.bool_]) -> Keypoints:
+        """Some of them, in their order.
+
+        Args:
+            chosen: (N,) bool.
+        """
+        return replace(
+            self,
+            pixels=self.pixels[chosen],
+            disparity_px=self.disparity_px[chosen],
+            sigma_px=self.sigma_px[chosen],
+            octaves=self.octaves[chosen],
+            descriptors=None if self.descriptors is None else self.descriptors[chosen],
+        )
+
 
 class Detect(Protocol):
     """Finds landmarks in a stereo pair."""
@@ -268,6 +283,14 @@ FEATURES: dict[DescriptorKind, FeatureKind] = {
         ),
     )
 }
+
+
+_OURS = (detect_corners, detect_corners_with_brief, detect_corners_with_net)
+
+
+def has_our_corners(kind: FeatureKind) -> bool:
+    """Whether a kind describes the front-end's own corners, of which more can be found."""
+    return kind.detect in _OURS
 
 
 def feature_kind(name: str) -> FeatureKind:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NewType
 
@@ -72,6 +73,19 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.pixels)
 
+    def rows(self, chosen: slice | NDArray[np.bool_]) -> Landmarks:
+        """Some of them, in their order.
+
+        Args:
+            chosen: a slice, or (N,) bool.
+        """
+        return Landmarks(*(getattr(self, name)[chosen] for name in Landmarks.__slots__))
+
+    def and_then(self, others: Landmarks) -> Landmarks:
+        """These, then others of the same kind."""
+        columns = ((getattr(self, name), getattr(others, name)) for name in Landmarks.__slots__)
+        return Landmarks(*(np.concatenate(pair) for pair in columns))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
@@ -85,6 +99,8 @@ class Frame:
             loaded.
         left_out: landmarks that were left out as they move with the camera: what is left is no
             better evidence than before.
+        further: finds the landmarks that the front-end chooses next, up to so many in all; None
+            where the images are not known any more.
     """
 
     stamp_ns: int
@@ -95,3 +111,16 @@ class Frame:
     status: FrameStatus
     thumbnail: NDArray[np.uint8] | None = None
     left_out: int = 0
+    further: Callable[[int], Landmarks] | None = None
+
+    def first(self, count: int) -> Frame:
+        """The frame with the first `count` of its landmarks."""
+        if len(self.landmarks) <= count:
+            return self
+        return replace(self, landmarks=self.landmarks.rows(slice(count)), further=None)
+
+    def with_further(self, count: int) -> Frame:
+        """The frame with those that the front-end chooses next behind its own, `count` in all."""
+        if self.further is None or count <= len(self.landmarks) + self.left_out:
+            return replace(self, further=None)
+        return replace(self, landmarks=self.landmarks.and_then(self.further(count)), further=None)

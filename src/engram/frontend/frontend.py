@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from functools import partial
+from typing import Annotated, NamedTuple
 
 import cv2
 import numpy as np
@@ -14,8 +15,15 @@ from engram import _core
 from engram.config import PUBLIC, check_bounds, config_hash, to_dict
 from engram.errors import ConfigError, IncompatibleError, SequenceError
 from engram.frontend.blobs import quantised_landmarks
-from engram.frontend.features import Keypoints, feature_kind
-from engram.frontend.frame import BRIEF, DescriptorKind, Frame, FrameStatus, StereoPair
+from engram.frontend.features import Keypoints, detect_corners, feature_kind, has_our_corners
+from engram.frontend.frame import (
+    BRIEF,
+    DescriptorKind,
+    Frame,
+    FrameStatus,
+    Landmarks,
+    StereoPair,
+)
 from engram.geometry.cameras import StereoCamera
 
 # Corners this close to the body, px of their octave, are its outline or lie behind it: FAST looks 3
@@ -46,19 +54,73 @@ def clear_of_body(corners: Keypoints, mask: NDArray[np.bool_]) -> Keypoints:
     columns, rows = np.rint(corners.pixels).astype(np.intp).T
     height, width = mask.shape
     at = clear_px[rows.clip(0, height - 1), columns.clip(0, width - 1)]
-    clear = at > _MARGIN_PX * 2.0**corners.octaves
-    return replace(
-        corners,
-        pixels=corners.pixels[clear],
-        disparity_px=corners.disparity_px[clear],
-        sigma_px=corners.sigma_px[clear],
-        descriptors=None if corners.descriptors is None else corners.descriptors[clear],
-        octaves=corners.octaves[clear],
+    return corners.rows(at > _MARGIN_PX * 2.0**corners.octaves)
+
+
+_NEVER = 254  # least score that a first look of a frame needs, so that the second one replaces it
+
+
+class Look(NamedTuple):
+    """The look that gave the corners of a frame: what finds more of them, and its threshold."""
+
+    config: FrontendConfig
+    threshold: int
+
+
+def look_of(pair: StereoPair, config: FrontendConfig) -> Look:
+    """The look that the front-end takes at a pair without a body, by the number of its settings."""
+    own = config.landmarks_for(pair.left.size)
+    once = replace(config, second_threshold=0)
+    if config.second_threshold == 0 or len(detect_corners(pair, once, own).pixels) >= own:
+        return Look(once, config.fast_threshold)
+    return Look(replace(config, fast_threshold=_NEVER), config.second_threshold)
+
+
+def further_landmarks(pair: StereoPair, config: FrontendConfig, count: int) -> Landmarks:
+    """The landmarks that the front-end chooses after a frame's own, up to `count` in all."""
+    kind, pair = feature_kind(config.descriptor), without_body(pair)
+    look = look_of(pair, config).config
+    found = detect_corners(pair, look, count)
+    own = rows_of(detect_corners(pair, look, config.landmarks_for(pair.left.size)), found)
+    further = found.rows(np.isin(np.arange(len(found.pixels)), own, invert=True))
+    if pair.mask is not None:
+        further = clear_of_body(further, pair.mask)
+    return quantised_landmarks(
+        further.pixels,
+        further.disparity_px,
+        further.sigma_px,
+        kind.describe(pair.left, further.pixels, further.octaves),
+        further.octaves,
+        pair.camera,
     )
+
+
+def rows_of(some: Keypoints, all_of_them: Keypoints) -> NDArray[np.intp]:
+    """Rows (N,) intp of some points among all, in order; no two share place and octave."""
+    known = {
+        (u, v, octave): row
+        for row, ((u, v), octave) in enumerate(
+            zip(all_of_them.pixels.tolist(), all_of_them.octaves.tolist(), strict=True)
+        )
+    }
+    wanted = zip(some.pixels.tolist(), some.octaves.tolist(), strict=True)
+    return np.array([known[u, v, octave] for (u, v), octave in wanted], dtype=np.intp)
+
+
+def as_live(frame: Frame, config: FrontendConfig | None = None) -> Frame:
+    """A node's frame as a live one: without the landmarks that only nodes have."""
+    config = config or FrontendConfig()
+    return frame.first(config.landmarks_for(frame.camera.width * frame.camera.height))
 
 
 # Raise it when equal settings give different landmarks.
 FRONTEND_VERSION = 1
+
+
+def scaled_to(pixels: int, landmarks: int) -> int:
+    """How many landmarks of an image of so many pixels are as many as these of 512 × 384."""
+    return round(landmarks * float((pixels / (512 * 384)) ** 0.6))
+
 
 _THUMBNAIL_WIDTH_PX = 160
 SMALLEST_SIDE_PX = 64
@@ -122,8 +184,7 @@ class FrontendConfig:
 
     def landmarks_for(self, pixels: int) -> int:
         """Landmarks wanted of an image of so many pixels; `landmarks` is for 512 × 384."""
-        relative_area = pixels / (512 * 384)
-        return max(1, round(self.landmarks * float(relative_area**0.6)))
+        return max(1, scaled_to(pixels, self.landmarks))
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -150,7 +211,7 @@ class Frontend:
     def extract(self, pair: StereoPair) -> Frame:
         """Corners with a disparity, their descriptors and points; image content never raises."""
         check_pair(pair)
-        pair, config = without_body(pair), self.config
+        whole, pair, config = pair, without_body(pair), self.config
         kind = feature_kind(config.descriptor)
         keypoints = kind.detect(pair, config, config.landmarks_for(pair.left.size))
         if pair.mask is not None:
@@ -173,6 +234,7 @@ class Frontend:
             frontend=self.hash,
             status=self._status(pair, len(keypoints.pixels), keypoints.candidates),
             thumbnail=make_thumbnail(pair.left) if config.thumbnails else None,
+            further=partial(further_landmarks, whole, config) if has_our_corners(kind) else None,
         )
 
     def _status(self, pair: StereoPair, landmarks: int, corners: int) -> FrameStatus:

@@ -13,18 +13,15 @@ from numpy.typing import NDArray
 
 from engram import _core
 from engram.frontend.blobs import quantised_landmarks
-from engram.frontend.features import (
-    Keypoints,
-    detect_corners,
-    detect_corners_with_brief,
-    detect_corners_with_net,
-    feature_kind,
-)
+from engram.frontend.features import Keypoints, detect_corners, feature_kind, has_our_corners
 from engram.frontend.frame import Landmarks, StereoPair
-from engram.frontend.frontend import FrontendConfig, clear_of_body, without_body
-
-_NEVER = 254  # least score that a first look of a frame needs, so that the second one replaces it
-_OURS = (detect_corners, detect_corners_with_brief, detect_corners_with_net)
+from engram.frontend.frontend import (
+    FrontendConfig,
+    clear_of_body,
+    look_of,
+    rows_of,
+    without_body,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +39,10 @@ class RankedLandmarks:
     def first(self, count: int) -> Landmarks:
         """The front-end's choice of so many, equal to the bit to extracting them."""
         return self._where(self.ranks < count)
+
+    def further(self, own: int, count: int) -> Landmarks:
+        """Those that it chooses after its first `own`, up to `count` in all."""
+        return self._where((self.ranks < count) & ~self._own(self.ranks, own))
 
     def parted(self, count: int) -> tuple[Landmarks, Landmarks]:
         """The `count` landmarks that were chosen first, and the others."""
@@ -78,7 +79,7 @@ class RankedLandmarks:
         return own
 
     def _where(self, rows: NDArray[np.bool_]) -> Landmarks:
-        return Landmarks(*(getattr(self.landmarks, name)[rows] for name in Landmarks.__slots__))
+        return self.landmarks.rows(rows)
 
 
 def ranked_landmarks(pair: StereoPair, config: FrontendConfig, most: int) -> RankedLandmarks | None:
@@ -87,20 +88,18 @@ def ranked_landmarks(pair: StereoPair, config: FrontendConfig, most: int) -> Ran
     Whether a second look is taken is decided by the number of the settings, whatever `most` is.
     """
     kind = feature_kind(config.descriptor)
-    if kind.detect not in _OURS:
+    if not has_our_corners(kind):
         return None
     pair = without_body(pair)
     own = config.landmarks_for(pair.left.size)
-    once = replace(config, second_threshold=0)
-    again = config.second_threshold > 0 and len(detect_corners(pair, once, own).pixels) < own
-    look = replace(config, fast_threshold=_NEVER) if again else once
-    found = detect_corners(pair, look, max(most, own))
-    threshold = config.second_threshold if again else config.fast_threshold
-    ranks = _ranks(pair.left, found, replace(config, fast_threshold=threshold), max(most, own))
+    look = look_of(pair, config)
+    found = detect_corners(pair, look.config, max(most, own))
+    counted = replace(config, fast_threshold=look.threshold)
+    ranks = _ranks(pair.left, found, counted, max(most, own))
     kept = found
     if pair.mask is not None:
         kept = clear_of_body(found, pair.mask)
-        ranks = ranks[_rows_of(kept, found)]
+        ranks = ranks[rows_of(kept, found)]
     landmarks = quantised_landmarks(
         kept.pixels,
         kept.disparity_px,
@@ -110,18 +109,6 @@ def ranked_landmarks(pair: StereoPair, config: FrontendConfig, most: int) -> Ran
         pair.camera,
     )
     return RankedLandmarks(landmarks, ranks)
-
-
-def _rows_of(some: Keypoints, all_of_them: Keypoints) -> NDArray[np.intp]:
-    """Rows of some points among all, whose order they keep; no two share place and octave."""
-    known = {
-        (u, v, octave): row
-        for row, ((u, v), octave) in enumerate(
-            zip(all_of_them.pixels.tolist(), all_of_them.octaves.tolist(), strict=True)
-        )
-    }
-    wanted = zip(some.pixels.tolist(), some.octaves.tolist(), strict=True)
-    return np.array([known[u, v, octave] for (u, v), octave in wanted], dtype=np.intp)
 
 
 def _ranks(

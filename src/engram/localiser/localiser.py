@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.frontend.frame import Frame, FrameStatus
+from engram.frontend.frontend import FrontendConfig
 from engram.graph.basin import MatchBasin
 from engram.graph.clock import Clocked, day_of, hour_of_day
 from engram.graph.graph import ExperienceGraph
@@ -105,12 +106,14 @@ class LiveDrive:
             results.
         saves: whether it is being mapped: then its own recent nodes are not candidates.
         clock: time zone and location of its stamps; None if unknown.
+        frontend: settings of the front-end that makes its frames.
     """
 
     basin: MatchBasin
     live: SessionId = UNNAMED_LIVE_SESSION
     saves: bool = False
     clock: Clocked | None = None
+    frontend: FrontendConfig = field(default_factory=FrontendConfig)
 
 
 _PREFETCH = 16
@@ -168,7 +171,12 @@ class Localiser:
         doubt = 0.0 if once else self.config.earlier_doubt
         self._track = Track(known.graph, doubt, self.config.greatest_gap_m)
         self._fixes = Fixes(
-            known.graph, self._track, self._nodes_near, self._attempter, self.config
+            known.graph,
+            self._track,
+            self._nodes_near,
+            self._attempter,
+            self.config,
+            drive.frontend,
         )
         self._open_loop_m = 0.0
         self._driven_m = 0.0

@@ -22,6 +22,8 @@ from msgspec import Meta
 from engram.config import PUBLIC, check_bounds
 from engram.errors import ConfigError, MapError
 from engram.frontend.frame import Frame, FrameStatus
+from engram.frontend.frontend import scaled_to
+from engram.geometry.cameras import StereoCamera
 from engram.graph.graph import ChainTree, ExperienceGraph
 from engram.graph.model import (
     Attempt,
@@ -452,6 +454,18 @@ class MapperConfig:
         proximity: which experiences are joined by dead reckoning; merging joins them alike.
     """
 
+    landmarks: Annotated[
+        int,
+        Meta(
+            ge=0,
+            le=100_000,
+            description="most landmarks of a saved node in a 512×384 image, scaled as "
+            "frontend.landmarks: those of the live frame and the next ones, so that a frame in "
+            "rain or at night finds more of its own there; 0: those of the live frame. "
+            "Source: lab/reports/constants.md",
+        ),
+        PUBLIC,
+    ] = 1000
     save_every_m: Annotated[float, PUBLIC] = 1.0
     save_every_rad: Annotated[float, PUBLIC] = float(np.deg2rad(15.0))
     sure_inliers: Annotated[int, PUBLIC] = 60
@@ -466,10 +480,15 @@ class MapperConfig:
             value = getattr(self, name)
             if not 0 <= value < np.inf:
                 raise ConfigError(f"mapper: {name} is {value}, must be finite and >= 0")
+        check_bounds(self)
         if self.sure_inliers < 0:
             raise ConfigError(f"mapper: sure_inliers is {self.sure_inliers}, must be >= 0")
         if self.checkpoint_every < 1:
             raise ConfigError(f"mapper: checkpoint_every is {self.checkpoint_every}, must be >= 1")
+
+    def landmarks_for(self, camera: StereoCamera) -> int:
+        """Most landmarks of a node of a camera."""
+        return scaled_to(camera.width * camera.height, self.landmarks)
 
 
 class Mapper(Memory):
@@ -559,7 +578,8 @@ class Mapper(Memory):
             saved, laid = save(live, result.measured)
             edges += laid
             visit = saved.id, PathEntryKind.SAVED
-        frame, attempts = live if saved else None, self._localiser.attempts()
+        attempts = self._localiser.attempts()
+        frame = live.with_further(self.config.landmarks_for(live.camera)) if saved else None
         records = Records(live.stamp_ns, saved, frame, edges, attempts, visit)
         self._saver.put(records, self._held_back)
         if saved is None:

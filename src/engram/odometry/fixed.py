@@ -14,8 +14,9 @@ forgotten when their landmarks move like the others.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import Enum, auto
+from functools import partial
 from typing import Annotated
 
 import cv2
@@ -494,7 +495,16 @@ class FixedPixels:
             # Its edges, which get few votes, are as far away as the thing itself.
             off_px = np.abs(frame.landmarks.disparity_px - self._around_px[rows, columns])
             clear &= off_px > self._config.same_disparity_px
-        return replace(_some(frame, clear), left_out=int(np.count_nonzero(~clear)))
+        further = frame.further
+        if further is not None and self._cells.any():
+            further = partial(self._further, frame)
+        left_out = int(np.count_nonzero(~clear))
+        return replace(_some(frame, clear), left_out=left_out, further=further)
+
+    def _further(self, frame: Frame, count: int) -> Landmarks:
+        """Those that the front-end chooses next, without those in fixed cells."""
+        assert frame.further is not None
+        return self._without(replace(frame, landmarks=frame.further(count), further=None)).landmarks
 
 
 def kept_rows(before: Frame, now: Frame, config: FixedConfig | None = None) -> NDArray[np.int32]:
@@ -545,16 +555,7 @@ def least_flow_px(
 
 def _some(frame: Frame, chosen: NDArray[np.bool_]) -> Frame:
     """The frame with some of its landmarks."""
-    landmarks = frame.landmarks
-    return replace(
-        frame,
-        landmarks=Landmarks(
-            *(
-                np.ascontiguousarray(getattr(landmarks, field.name)[chosen])
-                for field in fields(Landmarks)
-            )
-        ),
-    )
+    return replace(frame, landmarks=frame.landmarks.rows(chosen))
 
 
 def _there(rows: NDArray[np.int32], count: int) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from engram.config import PUBLIC, check_bounds
 from engram.errors import MapCorruptError
 from engram.frontend.features import feature_kind
+from engram.frontend.frontend import as_live
 from engram.frontend.matching import Match, match_frames, pair_seed
 from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
@@ -428,7 +429,7 @@ class SecondLooks:
     def _look(self, a: Near, b: Near, a_from_b: SE3) -> Look:
         ids = [self._graph.node(near.node).id for near in (a, b)]
         try:
-            reference, live = (self._frames.frame(node) for node in ids)
+            reference, live = self._frames.frame(ids[0]), as_live(self._frames.frame(ids[1]))
             matcher = feature_kind(live.descriptor).matcher
             match = match_frames(reference, live, matcher, pair_seed(ids[1], ids[0]))
         except MapCorruptError:

@@ -15,6 +15,7 @@ from engram.config import to_dict
 from engram.counts import counted
 from engram.errors import InputError, MapCorruptError
 from engram.frontend.features import feature_kind
+from engram.frontend.frontend import as_live
 from engram.frontend.matching import match_frames, pair_seed
 from engram.graph.model import NodeId, Removal
 from engram.graph.placing import DEFAULT_CONFIG as PLACING
@@ -71,7 +72,7 @@ def _inliers(
     """(K, 2) each: where the two nodes match, as fractions of their images."""
     nothing = np.zeros((0, 2), np.float32)
     try:
-        reference, live = frames.frame(a), frames.frame(b)
+        reference, live = frames.frame(a), as_live(frames.frame(b))
     except MapCorruptError:
         return nothing, nothing
     matcher = feature_kind(live.descriptor).matcher

@@ -24,6 +24,7 @@ from engram.config import PUBLIC, check_bounds
 from engram.counts import counted
 from engram.errors import ConfigError, InputError, MapCorruptError
 from engram.frontend.frame import Frame
+from engram.frontend.frontend import as_live
 from engram.frontend.matching import match_frames, pair_seed
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Anchor, Clock, Edge, EdgeKind, Goal, LandmarkSource, Node
@@ -805,7 +806,7 @@ class _Islands:
         try:
             match = match_frames(
                 self._frames.frame(ids[0]),
-                self._frames.frame(ids[1]),
+                as_live(self._frames.frame(ids[1])),
                 self._matcher,
                 pair_seed(ids[1], ids[0]),
             )

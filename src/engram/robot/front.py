@@ -144,6 +144,9 @@ class Front:
         """Takes a frame before the robot does, which is then given the result."""
         frame, motion = self._taken(arrived, outside, StageClock())
         self._ahead.append(motion)
+        if frame.further is not None:  # now: its images are not kept until the robot drives
+            further = frame.further(self._settings.mapper.landmarks_for(frame.camera))
+            frame = replace(frame, further=lambda _: further)
         return LoggedFrame(frame, motion.odometry)
 
     def take(

@@ -93,6 +93,7 @@ def localiser_in(
             parts.get("live", UNNAMED_LIVE_SESSION),
             parts.get("saves", False),
             parts.get("clock"),
+            settings.frontend,
         ),
         policy=ranking,
         budget=parts.get("budget") or Budget(),

@@ -131,7 +131,8 @@ class Recorder:
         pair = None
         if isinstance(arrived, StereoPair):
             pair = (arrived.left.copy(), arrived.right.copy())
-        self._put((LoggedFrame(frame, result.motion.odometry), pair, _decision(result, outcomes)))
+        logged = LoggedFrame(replace(frame, further=None), result.motion.odometry)
+        self._put((logged, pair, _decision(result, outcomes)))
         lost = result.status in _LOST
         if lost and self._knew:
             self._write_unasked("lost")

@@ -21,6 +21,7 @@ from engram.fleet.merge.merge_settings import MergeOptions, SeedFrom, Unit, loca
 from engram.fleet.merge.open_merge import Merge, beyond, recomposed, seen_from, uncertainty_m2
 from engram.fleet.merge.report import KeptNode, Reason, Seed, SegmentReport
 from engram.frontend.frame import Frame, FrameStatus
+from engram.frontend.frontend import as_live
 from engram.geometry.se3 import SE3
 from engram.graph.model import (
     Attempt,
@@ -431,7 +432,8 @@ class Replay(ResultSink):
             *(OdometryStep(OdometryStatus.OK, *motion) for motion in segment.motions),
         ]
         for stored, step in zip(frames.stored(segment.nodes), steps, strict=True):
-            yield stored, LoggedFrame(frames.decode(stored), step)
+            live = as_live(frames.decode(stored), self._settings.frontend)
+            yield stored, LoggedFrame(live, step)
 
     def _look_behind_gap(self, session: Session, segment: Segment) -> Ahead | None:
         """Looks for a segment from the end of the one before it; see `behind_gaps`."""
@@ -538,7 +540,7 @@ class Replay(ResultSink):
     def _take(self, held: Held) -> None:
         """Takes a node, with its own edges and the one to its match."""
         node, found = held.stored.node, held.found
-        index = self._merge.take(held.stored, held.live)
+        index = self._merge.take(held.stored, self._merge.robot.frames.decode(held.stored))
         self._taken.add(node.id)
         self._run.append(index)
         self._link(node.id)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, select
 
 from engram.errors import ConfigError, MapCorruptError, SequenceError
-from engram.frontend.frame import Frame
+from engram.frontend.frame import Frame, Landmarks
 from engram.frontend.ranked import RankedLandmarks
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import propagate_covariance
@@ -177,7 +178,9 @@ class FrameLog:
 
     def ranked(self, index: int) -> RankedLandmarks | None:
         """All landmarks that are kept of a chosen frame; None where there are no further ones."""
-        number = self._numbers[index]
+        return self._ranked_of(self._numbers[index])
+
+    def _ranked_of(self, number: int) -> RankedLandmarks | None:
         try:
             with self._file.errors(), self._engine.connect() as connection:
                 row, step = self._frame_row(connection, number)
@@ -185,6 +188,13 @@ class FrameLog:
                 return self._ranked(connection, row.digest, frame, number)
         except MapCorruptError as error:
             raise self._named(error) from error
+
+    def _further(self, number: int, own: int, count: int) -> Landmarks:
+        """The landmarks of a frame after its own, up to `count` in all; see `Frame.further`."""
+        ranked = self._ranked_of(number)
+        if ranked is None:
+            return self._read(number, None).frame.landmarks.rows(slice(0))
+        return ranked.further(own, count)
 
     def _ranked(
         self, connection: Connection, step_digest: bytes, frame: Frame, number: int
@@ -236,6 +246,9 @@ class FrameLog:
                     ranked = self._ranked(connection, row.digest, frame, number)
                     if ranked is not None:
                         frame = replace(frame, landmarks=ranked.first(self._landmarks))
+                if "more" in self._file.kind.metadata.tables:
+                    further = partial(self._further, number, len(frame.landmarks))
+                    frame = replace(frame, further=further)
                 odometry = self._motion(connection, previous, step)
         except MapCorruptError as error:
             raise self._named(error) from error
