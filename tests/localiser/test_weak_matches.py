@@ -16,6 +16,7 @@ from engram.graph.model import NodeId
 from engram.localiser.acceptance import AcceptanceConfig, Prediction, Rule, Spread
 from engram.localiser.attempts import Attempter, Candidate, Outcome, one_by_one
 from engram.localiser.confidence import Standing, confidence_of
+from engram.localiser.fixes import LEAST_WEIGHED
 from engram.localiser.settings import LocaliserConfig
 
 WORLD = World(40.0)
@@ -89,78 +90,10 @@ def test_a_robot_that_is_lost_for_long_believes_one_match_only_if_it_is_sure() -
     assert (True, True) in found.values()
 
 
-class Searches(Matches):
-    """What a wide search finds, and what a narrow one: so many inliers, so far off."""
-
-    def __init__(self, wide: tuple[int, float], narrow: tuple[int, float]) -> None:
-        super().__init__(wide[0], WIDE)
-        self._found = {"wide": wide, "narrow": narrow}
-        self.made: list[str] = []
-
-    def match(self, live: Frame, live_id: NodeId, node: NodeId, guide: Prediction | None) -> Match:
-        config = LocaliserConfig()
-        sigmas = None if guide is None else (guide.sigma_m, guide.sigma_yaw_rad)
-        narrow = sigmas == (config.narrow_m, config.narrow_rad)
-        self.made.append("narrow" if narrow else "wide")
-        inliers, off_m = self._found[self.made[-1]]
-        rows = np.arange(inliers, dtype=np.int32)
-        pose = SE3(np.eye(3), np.array([off_m, 0.0, 0.0]))
-        return Match(pose, 1e-4 * np.eye(6), inliers, rows, rows)
-
-
-EXPECTED = replace(NEAR, prediction=Prediction(SE3.identity(), 0.4, 0.02))
-
-
-def found(
-    searches: Searches, candidate: Candidate = EXPECTED, config: LocaliserConfig | None = None
-) -> tuple[int, float]:
-    match = attempted(searches, candidate, config).match
-    assert match.reference_from_live is not None
-    return match.inliers, float(match.reference_from_live.translation[0])
-
-
-@pytest.mark.parametrize(
-    ("wide", "narrow", "better"),
-    [
-        ((25, 1.2), (25, 0.1), True),
-        ((25, 1.2), (31, 0.1), True),
-        ((25, 1.2), (24, 0.1), False),
-        ((25, 1.2), (40, 1.3), False),
-        ((15, 0.2), (21, 0.1), True),
-        ((15, 0.2), (14, 0.1), False),
-        ((15, 0.9), (21, 0.1), False),
-    ],
-    ids=["as many", "more", "fewer", "no nearer", "weak: more", "weak: fewer", "weak: elsewhere"],
-)
-def test_what_is_weak_or_far_from_its_prediction_is_sought_near_it(
-    wide: tuple[int, float], narrow: tuple[int, float], better: bool
-) -> None:
-    searches = Searches(wide, narrow)
-    assert found(searches) == (narrow if better else wide)
-    assert searches.made == ["wide", "narrow"]
-
-
-PUBLISHED = LocaliserConfig(acceptance=AcceptanceConfig(rule=Rule.INLIERS))
-
-
-@pytest.mark.parametrize("config", [PUBLISHED, LocaliserConfig(narrow_m=0.0)], ids=["[L15]", "off"])
-def test_the_published_rule_makes_one_search(config: LocaliserConfig) -> None:
-    searches = Searches((25, 1.2), (90, 0.0))
-    assert found(searches, config=config) == (25, 1.2)
-    assert searches.made == ["wide"]
-
-
-@pytest.mark.parametrize(
-    ("wide", "candidate"),
-    [
-        ((25, 0.4), EXPECTED),
-        ((11, 0.4), EXPECTED),
-        ((25, 1.2), replace(EXPECTED, standing=Standing())),
-        ((25, 1.2), LOST),
-    ],
-    ids=["near and strong", "of no worth", "unconfirmed", "lost"],
-)
-def test_one_search_is_enough(wide: tuple[int, float], candidate: Candidate) -> None:
-    searches = Searches(wide, (90, 0.0))
-    assert found(searches, candidate) == wide
-    assert searches.made == ["wide"]
+@pytest.mark.parametrize(("rule", "least"), [(Rule.CONFIDENCE, LEAST_WEIGHED), (Rule.INLIERS, 20)])
+def test_fewer_inliers_than_the_rule_weighs_are_no_fix(rule: Rule, least: int) -> None:
+    config = LocaliserConfig(acceptance=AcceptanceConfig(rule=rule))
+    candidate = replace(NEAR, standing=replace(CONFIRMED, usual_inliers=16.0))
+    for inliers, accepted in ((least - 1, False), (least, True)):
+        outcome = attempted(Matches(inliers, WIDE), candidate, config)
+        assert outcome.accepted is accepted

@@ -97,7 +97,7 @@ def after(*found: Likeness, step_m: float = 2.0) -> Run:
     run = Run(LookalikeConfig())
     for number, one in enumerate(found):
         assert run.due(number * step_m)
-        run.add(one, number * step_m)
+        run.add(one.alike(), number * step_m)
     return run
 
 

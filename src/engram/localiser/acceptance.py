@@ -127,7 +127,8 @@ class AcceptanceConfig:
             its first fix. 0: neither does, before it is lost.
         rival_share: a match is refused if another of the frame, with this share of its inliers,
             lies more than `slack_m` from it and nearer to the prediction.
-        min_inliers: fewest inliers of a match with a prediction.
+        min_inliers: fewest inliers of a match. Where a position that fixes confirmed predicts it,
+            `confidence` weighs 12 and more.
         min_inliers_lost: fewest inliers of a match without a prediction; above every wrong match
             that passes the other tests.
         min_inliers_plausible: fewest inliers of a lost robot's match that counts only after a

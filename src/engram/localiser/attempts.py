@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
@@ -29,9 +29,9 @@ from engram.geometry.se3 import SE3
 from engram.graph.basin import MatchBasin
 from engram.graph.model import Attempt, LandmarkSource, NodeId
 from engram.graph.neighbourhood import Neighbourhood
-from engram.localiser.acceptance import Lenses, Prediction, Rule, Spread, inlier_spread
+from engram.localiser.acceptance import Lenses, Prediction, Spread, inlier_spread
 from engram.localiser.confidence import UNKNOWN, Evidence, Standing
-from engram.localiser.fixes import LEAST_WEIGHED, MatchRule
+from engram.localiser.fixes import MatchRule
 from engram.localiser.localisation import Position
 from engram.localiser.settings import LocaliserConfig
 from engram.ranking.recent import AttemptHistory
@@ -214,9 +214,7 @@ class Attempter:
         self._lanes = Lanes(frames, config.matcher, config.lost_matcher, lanes)
         self._matcher = self._lanes if matcher is None else matcher
         self._frames = frames
-        self._acceptance = config.acceptance
         self._rule = MatchRule(config.acceptance)
-        self._narrow = config.narrow_m, config.narrow_rad
 
     def close(self) -> None:
         """Ends the threads of the lanes."""
@@ -251,46 +249,10 @@ class Attempter:
             rank: place of the first candidate in the order.
         """
         matches = self._matcher.matches(live, live_id, candidates)
-        best = [
-            self._sought_closely(live, live_id, candidate, match)
-            for candidate, match in zip(candidates, matches, strict=True)
-        ]
         return [
             self._judged(live, live_id, rank + at, candidate, match)
-            for at, (candidate, match) in enumerate(zip(candidates, best, strict=True))
+            for at, (candidate, match) in enumerate(zip(candidates, matches, strict=True))
         ]
-
-    def _sought_closely(
-        self, live: Frame, live_id: NodeId, candidate: Candidate, match: Match | None
-    ) -> Match | None:
-        """The match, or one close to its prediction on which as many landmarks agree or more.
-
-        Of few landmarks that are right, a wide search may miss the pose that most of them agree on:
-        in rain it ends a metre off with 20 to 35 inliers, where a narrow one finds as many at the
-        right place. So where fixes confirm the position, what is weak or far from its prediction is
-        sought once more. What both find of a weak match must be one place: odometry may be wrong,
-        and much looks alike near where it puts the robot. The published rule makes one search.
-        """
-        prediction, acceptance = candidate.prediction, self._acceptance
-        once = acceptance.rule is Rule.INLIERS or not self._narrow[0]
-        if once or prediction is None or not candidate.standing.agreed:
-            return match
-        if match is None or match.reference_from_live is None or match.inliers < LEAST_WEIGHED:
-            return match
-        far_m = _apart_m(match.reference_from_live, prediction.node_from_live)
-        weak = match.inliers < acceptance.min_inliers
-        if not weak and far_m <= acceptance.slack_m:
-            return match
-        narrow = Prediction(prediction.node_from_live, *self._narrow)
-        near = replace(candidate, prediction=narrow, guided=True)
-        (closer,) = self._matcher.matches(live, live_id, [near])
-        if closer is None or closer.reference_from_live is None or closer.inliers < match.inliers:
-            return match
-        if weak:
-            moved_m = _apart_m(closer.reference_from_live, match.reference_from_live)
-            return closer if moved_m <= acceptance.slack_m else match
-        its_m = _apart_m(closer.reference_from_live, prediction.node_from_live)
-        return closer if its_m < far_m else match
 
     def _judged(
         self, live: Frame, live_id: NodeId, rank: int, candidate: Candidate, match: Match | None
@@ -327,10 +289,6 @@ def _expected(guide: Prediction | None) -> tuple[SE3 | None, NDArray[np.float64]
     covariance = np.zeros((6, 6))
     covariance.flat[:21:7], covariance.flat[21::7] = guide.sigma_m**2, guide.sigma_yaw_rad**2
     return guide.node_from_live, covariance
-
-
-def _apart_m(a: SE3, b: SE3) -> float:
-    return float(np.linalg.norm(a.translation - b.translation))
 
 
 def split_at_first_success(

@@ -275,18 +275,16 @@ class ConfidenceModel:
         return self.calibration.log_odds(sum(map(float.__mul__, weights, terms)))
 
 
-# Source: python -m engram_lab.fits.confidence --shipped --towns 301,302,303,304, method version 16:
-# 0.65, of `net` 0.58; one for both, so that limits mean the same.
+# Source: python -m engram_lab.fits.confidence, method version 23: 0.66; one for both kinds, so that
+# limits mean the same. `told` and `anywhere` are those of method version 10: a fit in today's towns
+# leans on the match's own sigma, which is small in any room, and tells look-alikes no better.
 _CALIBRATION = Calibration(knee=4.25, slope=0.65)
-# Source: python -m engram_lab.fits.confidence, with the covariances of method version 10; the
-# constant of `anywhere` is 0.2 more, so that under those of 11 the likest look-alike stays where it
-# was.
 _BRIEF = ConfidenceModel(
     # constant, inliers, share, distance, match sigma, missed, sigma, apart, ratio, agreed, tracked
-    predicted=(7.084, 0.0, 0.224, 0.0, -0.725, -1.378, -0.811, -1.668, 3.216, 0.0, -3.296),
+    predicted=(8.37, 0.0, 0.0, 0.0, 0.0, -3.036, -0.912, -1.568, 3.917, 0.0, -2.663),
     doubted=(  # the same terms, spread, height
-        *(11.957, 0.0, 0.0, -0.237, -0.119, -1.089, -0.612, -1.479, 4.347, 0.0, -5.02),
-        *(2.207, 0.657),
+        *(12.316, 0.0, 0.0, -0.338, 0.0, -1.507, -0.912, -1.64, 4.254, 0.0, -2.915),
+        *(2.214, 1.436),
     ),
     # constant, inliers, share, distance, match sigma, missed, sigma, apart, spread, height
     told=(10.864, 0.257, 1.212, -0.124, -0.347, -0.003, -0.174, -2.589, 1.544, 0.77),

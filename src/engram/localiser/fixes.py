@@ -38,6 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from engram.frontend.frame import Frame
+from engram.frontend.frontend import FrontendConfig
 from engram.frontend.matching import Match
 from engram.geometry.se3 import SE3
 from engram.graph.graph import ExperienceGraph
@@ -64,7 +65,7 @@ from engram.localiser.yardstick import Likeness, Run, Yardstick, is_measured
 if TYPE_CHECKING:
     from engram.localiser.attempts import Attempter, Candidate, Outcome
 
-# Matches of fewer inliers are wrong or useless; their spread is not worth computing.
+# Matches of fewer inliers are wrong or useless, and not weighed.
 LEAST_WEIGHED = 12
 
 
@@ -137,7 +138,9 @@ class MatchRule:
         the first: it confirms what would also be accepted without that position.
         """
         acceptance, confirmed = self.acceptance, candidate.standing.agreed > 0
-        if match.inliers < acceptance.min_inliers or not determined(match, acceptance):
+        expected = confirmed and candidate.prediction is not None
+        fewest = LEAST_WEIGHED if expected else acceptance.min_inliers
+        if match.inliers < fewest or not determined(match, acceptance):
             return False, False
         predicted, anywhere = readings
         least = sure = acceptance.min_confidence_lost
@@ -409,6 +412,7 @@ class Fixes:
     Args:
         graph: the experience graph; it may grow.
         track: the position of the robot; follows the fixes.
+        frontend: settings of the robot's front-end.
 
     Attributes:
         standing: of the position, when the frame began.
@@ -426,6 +430,7 @@ class Fixes:
         search: Callable[[Position], Neighbourhood],
         attempter: Attempter,
         config: LocaliserConfig,
+        frontend: FrontendConfig,
     ) -> None:
         self._graph = graph
         self._track = track
@@ -439,7 +444,7 @@ class Fixes:
         self._hypotheses = Hypotheses(
             graph, search, acceptance, config.followed_gap_m, config.hypotheses
         )
-        self.yardstick = Yardstick(graph, attempter.frame, config.matcher)
+        self.yardstick = Yardstick(graph, attempter.frame, config.matcher, frontend)
         self.standing = Standing()
         self.contradicted = False
         self.withdraws: tuple[int, ...] = ()
@@ -514,7 +519,7 @@ class Fixes:
         if self._run.due(driven_m):
             likeness = self._likeness(live, live_id, best)
             if likeness is not None:
-                self._run.add(likeness, driven_m)
+                self._run.add(likeness.alike(), driven_m)
         if self._run.believed:
             return outcomes
         self.lookalike = best

@@ -23,7 +23,7 @@ from engram.ranking.recent import RecentConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 22
+METHOD_VERSION = 23
 
 
 class NeighbourhoodSearch(StrEnum):
@@ -112,9 +112,6 @@ class LocaliserConfig:
             speaks for places of a lost robot is carried on.
         guide_below_m, guide_below_rad: the prediction guides an attempt if its standard deviations
             are below both; 0 turns guidance off. Source: `lab/reports/constants.md`.
-        narrow_m, narrow_rad: standard deviations of a second search near the prediction, where the
-            first ends with few inliers or far from it; 0 m: no second search. Source:
-            `lab/reports/trust.md`.
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.
             They keep 98.7 % of the matches it would accept. Source: `lab/reports/constants.md`.
         neighbourhood, path_entries, success, lens_depth_m, fix_sigmas, earlier_doubt: see their
@@ -135,8 +132,6 @@ class LocaliserConfig:
     followed_gap_m: float = 1.0
     guide_below_m: Annotated[float, PUBLIC] = 0.6
     guide_below_rad: Annotated[float, PUBLIC] = float(np.deg2rad(4.0))
-    narrow_m: float = 0.1
-    narrow_rad: float = 0.01
     earlier_doubt: Annotated[
         float,
         Meta(

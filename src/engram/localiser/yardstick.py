@@ -23,13 +23,12 @@ from numpy.typing import NDArray
 
 from engram.config import check_bounds
 from engram.frontend.frame import BRIEF, DescriptorKind, Frame, Landmarks
+from engram.frontend.frontend import FrontendConfig, as_live
 from engram.frontend.matching import Match, MatcherConfig, match_frames, pair_seed
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import EdgeKind, NodeId
 
-# Log-odds that a match is a look-alike: constant, and weights of ln(inliers / usual inliers), of
-# `more_bits` and of ln(`unevenness`); of one match at most. Source: `lab/reports/lookalikes.md`.
-_ALIKE, _OF_SHARE, _OF_BITS, _OF_UNEVENNESS = -6.6, -4.5, -0.1, 3.8
+# Log-odds of one match at most.
 _MOST = 3.0
 # A chain has a node each metre or so; a node farther away shows other things.
 _NEIGHBOUR_M = 4.0
@@ -107,6 +106,8 @@ class Yardstick:
     Args:
         graph: the experience graph; it may grow.
         frame: the frame of a node; None if it is damaged.
+        frontend: settings of the live robot's front-end: as such a live frame the neighbour is
+            matched; None for the defaults.
     """
 
     def __init__(
@@ -114,10 +115,12 @@ class Yardstick:
         graph: ExperienceGraph,
         frame: Callable[[NodeId], Frame | None],
         config: MatcherConfig,
+        frontend: FrontendConfig | None = None,
     ) -> None:
         self._graph = graph
         self._frame = frame
         self._config = config
+        self._frontend = frontend
         self._known: dict[int, Usual | None] = {}
 
     def usual(self, index: int) -> Usual | None:
@@ -134,6 +137,7 @@ class Yardstick:
         ours, theirs = self._frame(node), self._frame(neighbour)
         if ours is None or theirs is None:
             return None
+        theirs = as_live(theirs, self._frontend)
         match = match_frames(ours, theirs, self._config, pair_seed(node, neighbour))
         if match.reference_from_live is None:
             return None
@@ -206,6 +210,26 @@ def _in_view(match: Match, reference: Frame, live: Frame, usual: Usual) -> NDArr
 
 
 @dataclass(frozen=True, slots=True)
+class Weights:
+    """Log-odds that a match is a look-alike: a constant, and weights of `Likeness.terms`.
+
+    Attributes:
+        share: of ln(inliers / usual inliers).
+        more_bits: of each bit.
+        unevenness: of ln(unevenness).
+    """
+
+    constant: float
+    share: float
+    more_bits: float
+    unevenness: float
+
+
+# Source: `lab/reports/lookalikes.md`; its cost: python -m engram_lab.fits.lookalikes.
+ALIKE = Weights(-6.25, -4.5, -0.1, 3.8)
+
+
+@dataclass(frozen=True, slots=True)
 class Likeness:
     """Evidence of a match for or against being a look-alike.
 
@@ -229,11 +253,15 @@ class Likeness:
             unevenness(reference.landmarks, rows, match.reference_rows),
         )
 
-    def alike(self) -> float:
+    def terms(self) -> tuple[float, float, float]:
+        """What is weighed; see `Weights`."""
+        return self.share, self.more_bits, math.log(max(self.unevenness, _LEAST_UNEVENNESS))
+
+    def alike(self, weights: Weights = ALIKE) -> float:
         """Log-odds that it is a look-alike."""
-        alike = _ALIKE + _OF_SHARE * self.share + _OF_BITS * self.more_bits
-        alike += _OF_UNEVENNESS * math.log(max(self.unevenness, _LEAST_UNEVENNESS))
-        return min(max(alike, -_MOST), _MOST)
+        share, bits, uneven = self.terms()
+        alike = weights.constant + weights.share * share + weights.more_bits * bits
+        return min(max(alike + weights.unevenness * uneven, -_MOST), _MOST)
 
 
 class Run:
@@ -264,11 +292,11 @@ class Run:
             return True
         return not self.believed or since_m >= self._config.again_m
 
-    def add(self, found: Likeness, driven_m: float) -> None:
-        """Adds what a match shows after so many metres."""
+    def add(self, alike: float, driven_m: float) -> None:
+        """Adds a match, by its log-odds of being a look-alike, after so many metres."""
         config, first = self._config, self._at_m is None
         step_m = config.apart_m if self._at_m is None else driven_m - self._at_m
-        total = self._alike + min(step_m / config.apart_m, 1.0) * found.alike()
+        total = self._alike + min(step_m / config.apart_m, 1.0) * alike
         self._alike = min(max(total, -config.most), config.most)
         self._at_m = driven_m
         usual = self._alike <= -config.proof

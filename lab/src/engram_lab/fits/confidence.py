@@ -46,6 +46,7 @@ from engram.monitor import Monitor, write_whole
 from engram.robot.settings import Settings
 from engram_lab.accuracy import SURE, is_false
 from engram_lab.programs import Figure, command_line, numbers, report
+from engram_lab.studies.conditions import Conditions
 from engram_lab.studies.streets import (
     AT_NIGHT,
     FITTED_TOWNS,
@@ -68,8 +69,15 @@ from engram_lab.town.simulating import campaign_folder
 
 Array = NDArray[np.float64]
 
+# Towns with drives in every condition that nothing else is fitted on, and judges.
+FITTED_SMALL, HELD_OUT_SMALL = (511,), (505,)
 # Tries of each kind on each street.
 TRIES = {Kind.UNDISTURBED: 1, Kind.MISPLACED: 24, Kind.CARRIED: 24, Kind.GAP: 6, Kind.LOST: 6}
+_FEWER = {Kind.UNDISTURBED: 1, Kind.MISPLACED: 8, Kind.CARRIED: 8, Kind.GAP: 3, Kind.LOST: 3}
+# Maps and drives of small towns: the other light, rain by day and at night, a pane, snow.
+_IN_SMALL_TOWNS = (
+    ((0,), 2), ((0,), 4), ((2,), 3), ((2,), 9), ((2,), 10), ((0, 2), 6), ((0, 2), 10),
+)  # fmt: skip
 _LOST_ROUNDS = 8
 # Before there is a calibration.
 AS_SUMMED = Calibration(knee=0.0, slope=1.0)
@@ -148,9 +156,25 @@ class Rows:
     alike: list[Row]
 
 
-def collected(towns: Sequence[int], folder: Path, settings: Settings, monitor: Monitor) -> Rows:
-    """The rows of some towns; those that an earlier run collected are read."""
+def collected(
+    towns: Sequence[int],
+    small: Sequence[int],
+    folder: Path,
+    settings: Settings,
+    monitor: Monitor,
+) -> Rows:
+    """The rows of some towns; those that an earlier run collected are read.
+
+    Args:
+        small: towns with drives in every condition, of `engram_lab.studies.conditions`.
+    """
     rows = Rows([], [])
+    for seed in small:
+        for mapped, number in _IN_SMALL_TOWNS:
+            town = Conditions(settings, settings.frontend.landmarks, folder / "maps", mapped)
+            name = f"small-{seed}-{'-'.join(map(str, mapped))}-{number}"
+            live = town.drives(seed)[number]
+            _collect(rows, folder / name, town.street(seed, live), _FEWER, monitor)
     for which in (STREETS, AT_NIGHT):
         for name, there in streets(towns, settings, _LOST_ROUNDS, monitor, which):
             _collect(rows, folder / name.replace("/", "-"), there, TRIES, monitor)
@@ -373,7 +397,7 @@ def passing(model: ConfidenceModel, rows: Rows) -> Iterator[Figure]:
                 for row in some
                 if (row.evidence.standing.agreed > 0) is agreed
                 and np.isfinite(row.evidence.apart)
-                and row.evidence.inliers >= limits.min_inliers
+                and row.evidence.inliers >= LEAST_INLIERS
                 and row.evidence.match_sigma_m <= limits.max_sigma_m
             ]
             passed = sum(model.as_predicted(one) >= least for one in known)
@@ -442,13 +466,15 @@ def main() -> None:
     parser.add_argument("--kind", type=DescriptorKind, default=BRIEF, help="of features")
     parser.add_argument("--towns", type=numbers, default=list(FITTED_TOWNS))
     parser.add_argument("--held-out", type=numbers, default=list(HELD_OUT_TOWNS))
+    parser.add_argument("--small", type=numbers, default=list(FITTED_SMALL))
+    parser.add_argument("--held-out-small", type=numbers, default=list(HELD_OUT_SMALL))
     parser.add_argument("--estates", type=numbers, default=[], help="towns of equal fronts")
     parser.add_argument("--shipped", action="store_true", help="judge the weights that are shipped")
     asked = parser.parse_args()
     settings = Settings().for_descriptor(asked.kind)
     folder = towns_folder(settings) / "confidence"
     folder.mkdir(parents=True, exist_ok=True)
-    rows = collected(asked.towns, folder, settings, Bars())
+    rows = collected(asked.towns, asked.small, folder, settings, Bars())
     model = confidence_of(asked.kind)
     if not asked.shipped:
         model = fitted(rows, model.weak_inliers)
@@ -457,7 +483,7 @@ def main() -> None:
     else:
         print(f"{calibrated(model, rows.met)} would fit these weights")
     report(passing(model, rows), None, "confidence, fitted towns")
-    held_out = collected(asked.held_out, folder, settings, Bars())
+    held_out = collected(asked.held_out, asked.held_out_small, folder, settings, Bars())
     report(judged(model, held_out.met, rows.met), asked.json, "confidence, held-out towns")
     if asked.estates:
         alike = estate_rows(asked.estates, settings, Bars())

@@ -1,7 +1,7 @@
 """What a robot localises by condition, in a map of one clear morning and one fair night.
 
     python -m engram_lab.studies.conditions --maps maps --towns 22 --landmarks 600,1000
-    python -m engram_lab.studies.conditions --maps maps --set localiser.narrow_m=0 --misplaced 15
+    python -m engram_lab.studies.conditions --maps maps --set mapper.landmarks=0 --misplaced 15
 
 Small towns of one loop, eleven drives each in all kinds of light and weather. Each drive that is
 not in the map is localised in it by the product's robot, from a given place, once. With
