@@ -323,3 +323,7 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
         study_of("nclt", tmp_path, tmp_path / "out", "brief")
     with pytest.raises(SequenceError, match="0 drives of Oxford RobotCar"):
         study_of("robotcar", tmp_path, tmp_path / "out", "brief").run()
+    for place in ("a", "b"):
+        (tmp_path / place / "2014-05-14-13-53-47" / "stereo" / "left").mkdir(parents=True)
+    with pytest.raises(SequenceError, match="drives of one name; leave one there"):
+        study_of("robotcar", tmp_path, tmp_path / "out", "brief").run()

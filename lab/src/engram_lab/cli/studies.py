@@ -305,7 +305,7 @@ def budgets(
 
     \b
     Examples:
-      engram lab evaluate budgets begbroke24h --only-folds 0,1
+      engram lab evaluate budgets begbroke24h --only-folds 0
       engram lab evaluate budgets hamlet --folds 3 --sizes 2 --attempts 1,4
     """
     from engram.cli.screen import Bars

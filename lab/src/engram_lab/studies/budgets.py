@@ -1,6 +1,6 @@
 """Where does ranking pay? Policies by experiences at a place, attempts a frame, and processor time.
 
-    engram lab evaluate budgets begbroke24h --only-folds 0,1
+    engram lab evaluate budgets begbroke24h --only-folds 0
 
 Maps save every drive whole, so that each place has as many experiences as drives were mapped.
 Held-out drives are localised in maps of the first 2, 5, 10, … drives with so many attempts a frame,

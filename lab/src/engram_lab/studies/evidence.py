@@ -124,9 +124,9 @@ STUDIES: Mapping[str, Study] = {
     "budgets": Study(
         (
             "engram lab simulate begbroke24h",
-            f"{_EVALUATE}budgets begbroke24h --only-folds 0,1 --out {{out}}",
+            f"{_EVALUATE}budgets begbroke24h --only-folds 0 --out {{out}}",
         ),
-        150,
+        60,
         ("sessions.csv", "cells.csv", "times.csv"),
         ("docs/ranking.md",),
         campaigns=("begbroke24h",),

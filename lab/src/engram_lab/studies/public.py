@@ -368,6 +368,11 @@ class PublicStudy:
             raise SequenceError(
                 f"{self.folder}: {len(found)} drives of {self.set.title}, must be at least {least}"
             )
+        names = [one.name for one in found]
+        if twice := [one for one in found if names.count(one.name) > 1]:
+            raise SequenceError(
+                f"{' and '.join(map(str, twice))}: drives of one name; leave one there"
+            )
         judge = self.set.judge(self.folder, found)
         make_folder(self.out)
         with writing(self.out):
