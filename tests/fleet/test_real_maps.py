@@ -17,9 +17,9 @@ from engram.maps.map_files import check_file
 from engram.robot.mapping import map_drive
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import localise_drive, summarise
-from engram.sequences.motion_files import Trajectory
+from engram.sequences.motion_files import Trajectory, read_kitti_poses
 from engram.sequences.opening import open_drive
-from engram_lab.truth import read_kitti_poses, read_matrix_truth
+from engram_lab.truth import read_matrix_truth
 
 pytestmark = pytest.mark.data
 

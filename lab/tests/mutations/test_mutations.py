@@ -157,6 +157,7 @@ MAP_VERBS = [
     "log MAP --oneline",
     "merge fleet.engram MAP",
     "plot MAP out.png --by robot",
+    "report MAP --out out.html",
     "revert MAP 1 --dry-run",
     "show MAP",
     "show MAP 1",
@@ -180,12 +181,15 @@ DRIVE_VERBS = [
     "doctor LOG",
     "drive info LOG",
     "drive calibration LOG",
+    "evaluate LOG --truth LOG",
     "record LOG out.framelog",
+    "report LOG --out out.html",
 ]
 # They show nothing of a map or a drive: their own files, or long work of the laboratory.
 OWN = {
     "settings", "features", "try", "demo", "lab bench", "lab fleet-day", "lab simulate",
-    "lab evaluate faults", "lab evaluate fleet", "lab evaluate ranking", "lab evaluate scale",
+    "lab evaluate all", "lab evaluate budgets", "lab evaluate faults", "lab evaluate fleet",
+    "lab evaluate public", "lab evaluate ranking", "lab evaluate scale",
 }  # fmt: skip
 
 

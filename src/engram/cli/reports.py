@@ -7,13 +7,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
-from numpy.typing import NDArray
 
 from engram.cli import options
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from engram.evaluation import Evaluation
     from engram.frontend.frame import StereoPair
     from engram.robot.front import Arrived
@@ -97,7 +98,7 @@ def _map_page(path: Path) -> Page:
         typed("engram", "plot", town, "map.png"),
         typed("engram", "check", town),
         typed("engram", "log", town),
-        f"{typed('engram', 'localise', town)} DRIVE --report drive.html",
+        f"{typed('engram', 'localise', town)} DRIVE --report monday.html",
     ]
     return map_page(town, lines)
 
@@ -123,7 +124,7 @@ def _drive_page(path: Path, settings: options.SettingsGiven) -> Page:
     lines = [
         typed("engram", "doctor", path),
         typed("engram", "map", "MAP.engram", path),
-        typed("engram", "localise", "MAP.engram", path, "--report", "drive.html"),
+        typed("engram", "localise", "MAP.engram", path, "--report", "monday.html"),
     ]
     return examined_page(str(path), diagnosis, pairs, lines)
 
@@ -199,6 +200,8 @@ def read_truth(path: Path, stamps_ns: NDArray[np.int64]) -> Trajectory:
 
 
 def _driven(path: Path, settings: options.SettingsGiven) -> _Driven:
+    import numpy as np
+
     from engram.cli.screen import Bars
     from engram.robot.results import odometry_trajectory, read_result
     from engram.sequences.motion_files import read_tum
