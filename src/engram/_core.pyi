@@ -363,6 +363,9 @@ class OdometrySettings:
     steady_m: float
     steady_rad: float
     steady_share: float
+    braking_m_s2: float
+    braking_share: float
+    disbelief_s: float
     keyframe_flow_px: float
     keyframe_share: float
 

@@ -129,10 +129,14 @@ def test_a_sudden_turn_is_found_without_the_prediction() -> None:
     assert (step.prev_from_curr @ poses[-1].inverse() @ poses[-2]).distance_m < 0.03
 
 
-def riding_along(frames: list[Frame], count: int, seed: int) -> list[Frame]:
-    """The frames with so many landmarks that keep their pixels, as drops on the lens do."""
+def riding_along(frames: list[Frame], count: int, seed: int, least_px: float = 3.0) -> list[Frame]:
+    """The frames with so many landmarks that keep their pixels, as drops on the lens do.
+
+    Args:
+        least_px: their least disparity.
+    """
     rng = np.random.default_rng(seed)
-    disparity_px = rng.uniform(3, 20, count)
+    disparity_px = rng.uniform(least_px, 20, count)
     pixels = np.column_stack([rng.uniform(0, 512, count), rng.uniform(0, 384, count)])
     depth_m = CAMERA.focal_baseline / disparity_px
     rays = (pixels - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy]
@@ -174,6 +178,51 @@ def test_of_two_motions_the_one_at_the_last_speed_needs_fewer_landmarks() -> Non
     assert steady.moved_m == pytest.approx(0.7, abs=0.03)
     assert most.moved_m < 0.6
     assert most.inliers > 1.2 * steady.inliers
+
+
+def newest(frame: Frame, count: int) -> Frame:
+    """The frame with its last landmarks alone."""
+    names = [one.name for one in dataclasses.fields(Landmarks)]
+    last = Landmarks(**{name: getattr(frame.landmarks, name)[-count:] for name in names})
+    return dataclasses.replace(frame, landmarks=last)
+
+
+def test_the_speed_before_an_impossible_stop_is_remembered() -> None:
+    """For a second nothing is seen but the robot's own beam, then the world again, too."""
+    slow, _ = drive(16, 11, motion=SE3.exp([0.0, 0.0, 0.7, 0.0, 0.01, 0.0]))
+    frames = [dataclasses.replace(one, stamp_ns=3 * one.stamp_ns // 2) for one in slow]
+    count = 500  # 200 of the world will agree, between a third and half of that
+    lit = riding_along(frames, count, 3, least_px=15)
+    night = frames[:4] + lit[4:6] + [newest(one, count) for one in lit[6:12]] + lit[12:]
+    moved = []
+    for seconds in (OdometryConfig().disbelief_s, 0.0):
+        odometry = Odometry(OdometryConfig(disbelief_s=seconds))
+        moved.append([odometry.step(frame) for frame in night])
+    remembering, forgetful = moved
+    for step in remembering[6:12]:
+        assert step.moved_m < 0.1
+        assert step.covariance is not None
+        assert step.covariance[2, 2] > 0.5**2
+    for step in remembering[13:]:
+        assert step.moved_m == pytest.approx(0.7, abs=0.03)
+        assert step.covariance is not None
+        assert step.covariance[2, 2] < 0.1**2
+    assert all(step.moved_m < 0.1 for step in forgetful[13:])
+
+
+@pytest.mark.parametrize("late", [0.0, 0.05])
+def test_a_robot_that_brakes_is_believed(late: float) -> None:
+    """With 8 m/s², the stamps of every other frame so many seconds late."""
+    scene, odometry = Scene(3000, 12), Odometry()
+    pose, speed_m_s = SE3.identity(), 5.0
+    for k in range(14):
+        stamp_ns = k * INTERVAL_NS + (k % 2) * round(late * 1e9)
+        step = odometry.step(scene.seen_from(pose, stamp_ns=stamp_ns)[0])
+        if step.prev_from_curr is not None:
+            assert step.covariance is not None
+            assert step.covariance[2, 2] < 0.03**2
+        speed_m_s = max(speed_m_s - 0.8 * (k > 5), 0.0)
+        pose = pose @ SE3.exp([0.0, 0.0, 0.1 * speed_m_s, 0.0, 0.0, 0.0])
 
 
 def test_a_sudden_stop_is_believed_where_the_world_stands() -> None:
@@ -272,6 +321,7 @@ def test_another_camera_or_descriptor_is_a_clear_error() -> None:
         lambda: WindowConfig(landmarks=0),
         lambda: WindowConfig(pixel_sigma_px=0.0),
         lambda: OdometryConfig(steady_share=1.5),
+        lambda: OdometryConfig(braking_share=0.0),
     ],
 )
 def test_senseless_settings_are_refused(senseless) -> None:

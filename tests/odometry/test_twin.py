@@ -23,11 +23,11 @@ WITHIN = 1e-9
 
 
 def eventful() -> Iterator[Frame]:
-    """A drive with an unusable frame, a stop of the camera, another place, and a return."""
+    """An unusable frame, a stop of the camera, another place, a return, a stop at once."""
     here, _ = drive(12, 3)
     there, _ = drive(4, 4, offset_px=0.2)
     here[4] = unusable(here[4])
-    order = [*here, *there, *here[::-1]]
+    order = [*here, *there, *here[::-1], *[here[0]] * 4, *here[:4]]
     late = (7, 20)  # a camera that stops for seconds: once it comes back to the same place
     stamp_ns = 0
     for k, frame in enumerate(order):

@@ -22,6 +22,8 @@ _USUAL_OF = 20
 _GAP_RATIO = 1.5
 # A motion nearer than this to the last speed goes on as before.
 _STEADY_SIGMAS = 2.0
+# A robot that lost this share of its speed has stopped; a step vaguer than that tells no speed.
+_STOPPED_SHARE = 0.5
 _UNSEEN = -1
 
 
@@ -267,6 +269,10 @@ class _Track:
         self._covariance = np.zeros((6, 6))  # of keyframe_from_prev
         self._searched = np.zeros((6, 6))  # the same, as wide as matching searches
         self._velocity: NDArray[np.float64] | None = None  # (6,) tangent per second
+        # Of the last step that was neither vague nor an impossible stop, with its length, m, and
+        # its frame's stamp.
+        self._believed: tuple[NDArray[np.float64], float, int] | None = None
+        self._stopped = False
 
     @property
     def offset_px(self) -> float:
@@ -282,9 +288,13 @@ class _Track:
         return bool(changed_m <= 0.5 * self._config.acceleration_m_s2 * interval_s**2)
 
     def match(self, frame: Frame, expected: Guess | None = None) -> Match:
-        """Match to the keyframe; if that fails, to the previous frame."""
+        """Match to the keyframe; if that fails or stops at once, to the previous frame."""
         match = self._match_to_keyframe(frame, expected)
-        if match.inliers < self._config.min_inliers and self._window.has_newest:
+        fails = match.inliers < self._config.min_inliers
+        if match.reference_from_live is not None:
+            moved = self._keyframe_from_prev.inverse() @ match.reference_from_live
+            fails = fails or self._stops_at_once(moved, frame.stamp_ns)
+        if fails and self._window.has_newest:
             self._keep_previous_as_keyframe()
             match = self._match_to_keyframe(frame, expected)
         return match
@@ -326,12 +336,47 @@ class _Track:
         )
         interval_s = (frame.stamp_ns - self.stamp_ns) * _S_PER_NS
         self._velocity = prev_from_curr.log() / interval_s if interval_s > 0 else None
+        stops = self._stops_at_once(prev_from_curr, frame.stamp_ns)
+        assert step.covariance is not None
+        sigma_m, step_m = float(np.sqrt(np.trace(step.covariance[:3, :3]))), step.moved_m
+        if stops:
+            assert self._believed is not None
+            self._stopped = True
+            further_m = self._believed[0][:3] * interval_s - prev_from_curr.translation
+            step.covariance[:3, :3] += np.outer(further_m, further_m)
+        elif self._velocity is not None and sigma_m <= _STOPPED_SHARE * step_m:
+            self._believed, self._stopped = (self._velocity, step_m, frame.stamp_ns), False
+        elif self._velocity is None or not self._counts(frame.stamp_ns):
+            self._believed, self._stopped = None, False
         self.stamp_ns = frame.stamp_ns
         self._keyframe_from_prev, self._covariance = keyframe_from_curr, covariance
         self._searched = searched
-        if self._has_moved_on(frame, match):
+        if stops:
+            self._window = Window(frame, self._config, self.offset_px)
+            self._begin_at_previous()
+        elif self._has_moved_on(frame, match):
             self._keep_previous_as_keyframe()
         return step
+
+    def _stops_at_once(self, prev_from_curr: SE3, stamp_ns: int) -> bool:
+        """Whether a step is, or goes on with, a stop faster than any robot brakes."""
+        interval_s = (stamp_ns - self.stamp_ns) * _S_PER_NS
+        if interval_s <= 0 or self._believed is None or not self._counts(stamp_ns):
+            return False
+        velocity, step_m, believed_ns = self._believed
+        speed_m_s = float(np.linalg.norm(velocity[:3]))
+        was_m_s = min(speed_m_s, step_m / interval_s)
+        along = velocity[:3] / max(speed_m_s, 1e-9)
+        lost_m_s = was_m_s - float(prev_from_curr.log()[:3] @ along) / interval_s
+        since_s = (stamp_ns - believed_ns) * _S_PER_NS
+        braked_m_s = 0.0 if self._stopped else self._config.braking_m_s2 * since_s
+        return lost_m_s > max(_STOPPED_SHARE * was_m_s, braked_m_s)
+
+    def _counts(self, stamp_ns: int) -> bool:
+        """Whether the believed speed is recent."""
+        if self._believed is None:
+            return False
+        return (stamp_ns - self._believed[2]) * _S_PER_NS <= self._config.disbelief_s
 
     def _match_to_keyframe(self, frame: Frame, expected: Guess | None) -> Match:
         """Guided by constant velocity or what is expected; if that fails, unguided."""
@@ -357,7 +402,9 @@ class _Track:
                 propagate_covariance(self._keyframe_from_prev, self._searched, expected.covariance),
             )
         square = interval_s**2
+        assert self._velocity is not None
         return self._by_speed(
+            self._velocity,
             interval_s,
             self._config.acceleration_m_s2 * square,
             self._config.angular_acceleration_rad_s2 * square,
@@ -367,12 +414,15 @@ class _Track:
         return self._velocity is not None and 0 < interval_s <= self._config.max_prediction_s
 
     def _by_speed(
-        self, interval_s: float, sigma_m: float, sigma_rad: float
+        self,
+        velocity: NDArray[np.float64],
+        interval_s: float,
+        sigma_m: float,
+        sigma_rad: float,
     ) -> tuple[SE3, NDArray[np.float64]]:
-        assert self._velocity is not None
         noise = np.diag(np.repeat([sigma_m, sigma_rad], 3) ** 2)
         return (
-            self._keyframe_from_prev @ SE3.exp(self._velocity * interval_s),
+            self._keyframe_from_prev @ SE3.exp(velocity * interval_s),
             propagate_covariance(self._keyframe_from_prev, self._searched, noise),
         )
 
@@ -381,17 +431,28 @@ class _Track:
         config, interval_s = self._config, (frame.stamp_ns - self.stamp_ns) * _S_PER_NS
         if match.reference_from_live is None or not self._knows_speed(interval_s):
             return match
-        steady = self._by_speed(interval_s, config.steady_m, config.steady_rad)
+        assert self._velocity is not None
+        velocity = self._velocity
+        if self._stopped:
+            assert self._believed is not None
+            velocity = self._believed[0]
+        steady = self._by_speed(velocity, interval_s, config.steady_m, config.steady_rad)
         away = _sigmas_away(steady, match)
         if away <= _STEADY_SIGMAS:
             return match
         seed = frame.stamp_ns % 2**64
         again = match_frames(self._window.keyframe, frame, config.matcher, seed, *steady)
-        enough = again.inliers >= max(config.steady_share * match.inliers, config.min_inliers)
+        moved = self._keyframe_from_prev.inverse() @ match.reference_from_live
+        stops = self._stops_at_once(moved, frame.stamp_ns)
+        share = config.braking_share if stops else config.steady_share
+        enough = again.inliers >= max(share * match.inliers, config.min_inliers)
         return again if enough and _sigmas_away(steady, again) < away else match
 
     def _keep_previous_as_keyframe(self) -> None:
         self._window.keep_newest()
+        self._begin_at_previous()
+
+    def _begin_at_previous(self) -> None:
         self._keyframe_from_prev = SE3.identity()
         self._covariance, self._searched = np.zeros((6, 6)), np.zeros((6, 6))
 

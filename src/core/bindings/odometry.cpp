@@ -94,6 +94,9 @@ void bind_odometry(nb::module_ &module) {
       .def_rw("steady_m", &OdometrySettings::steady_m)
       .def_rw("steady_rad", &OdometrySettings::steady_rad)
       .def_rw("steady_share", &OdometrySettings::steady_share)
+      .def_rw("braking_m_s2", &OdometrySettings::braking_m_s2)
+      .def_rw("braking_share", &OdometrySettings::braking_share)
+      .def_rw("disbelief_s", &OdometrySettings::disbelief_s)
       .def_rw("keyframe_flow_px", &OdometrySettings::keyframe_flow_px)
       .def_rw("keyframe_share", &OdometrySettings::keyframe_share);
   nb::class_<Odometry>(module, "Odometry", "Visual odometry of one camera, frame by frame.")

@@ -22,6 +22,8 @@ constexpr size_t kUsualOf = 20;
 constexpr double kGapRatio = 1.5;
 // A motion nearer than this to the last speed goes on as before.
 constexpr double kSteadySigmas = 2;
+// A robot that lost this share of its speed has stopped; a step vaguer than that tells no speed.
+constexpr double kStoppedShare = 0.5;
 
 void remember(std::vector<double> &values, double value) {
   if (values.size() == kUsualOf)
@@ -42,8 +44,8 @@ double usual(std::vector<double> values, double unknown) {
   return values.empty() ? unknown : median(values);
 }
 
-double seconds_since(const OdometryTrack &track, int64_t stamp_ns) {
-  return static_cast<double>(stamp_ns - track.stamp_ns) * kSecondsPerNs;
+double seconds_between(int64_t from_ns, int64_t to_ns) {
+  return static_cast<double>(to_ns - from_ns) * kSecondsPerNs;
 }
 
 bool knows_speed(const OdometryTrack &track, const OdometrySettings &settings, double interval_s) {
@@ -51,10 +53,10 @@ bool knows_speed(const OdometryTrack &track, const OdometrySettings &settings, d
 }
 
 // By constant velocity, give or take so much.
-Prediction by_speed(const OdometryTrack &track, double interval_s, double sigma_m,
-                    double sigma_rad) {
+Prediction by_speed(const OdometryTrack &track, const Tangent &velocity, double interval_s,
+                    double sigma_m, double sigma_rad) {
   const RigidTransform &keyframe_from_prev = track.keyframe_from_prev;
-  Tangent moved = *track.velocity;
+  Tangent moved = velocity;
   for (double &entry : moved)
     entry *= interval_s;
   Covariance noise{};
@@ -69,7 +71,7 @@ std::optional<Prediction> predict(const OdometryTrack &track, const OdometrySett
                                   double interval_s, const ExpectedMotion *expected) {
   if (knows_speed(track, settings, interval_s)) {
     const double square = interval_s * interval_s;
-    return by_speed(track, interval_s, settings.acceleration_m_s2 * square,
+    return by_speed(track, *track.velocity, interval_s, settings.acceleration_m_s2 * square,
                     settings.angular_acceleration_rad_s2 * square);
   }
   if (expected == nullptr)
@@ -98,6 +100,12 @@ double sigmas_away(const Prediction &prediction, const RigidTransform &pose) {
   return most;
 }
 
+// Of a speed before, what is left in its direction.
+double left_of(const Tangent &before, const Tangent &now) {
+  const Vec3 was{before[0], before[1], before[2]};
+  return dot(was, {now[0], now[1], now[2]}) / std::max(norm(was), 1e-9);
+}
+
 int32_t inliers_of(const PoseEstimate &match) {
   return match.found ? static_cast<int32_t>(match.inliers.size()) : 0;
 }
@@ -108,7 +116,7 @@ public:
        int64_t stamp_ns, const ExpectedMotion *expected)
       : state_(state), settings_(settings), live_(live), stamp_ns_(stamp_ns),
         expected_(expected), track_(*state.track),
-        interval_s_(seconds_since(track_, stamp_ns)) {}
+        interval_s_(seconds_between(track_.stamp_ns, stamp_ns)) {}
 
   OdometryMotion run() {
     const PoseEstimate match = matched();
@@ -135,10 +143,11 @@ public:
   }
 
 private:
-  // To the keyframe; if that fails, to the previous frame.
+  // To the keyframe; if that fails, or ends in an impossible stop, to the previous frame.
   PoseEstimate matched() {
     PoseEstimate match = matched_to_keyframe();
-    if (inliers_of(match) < settings_.min_inliers && track_.window.newest) {
+    const bool fails = inliers_of(match) < settings_.min_inliers || stops_at_once(match);
+    if (fails && track_.window.newest) {
       keep_previous_as_keyframe();
       match = matched_to_keyframe();
     }
@@ -163,13 +172,15 @@ private:
     if (!match.found || !knows_speed(track_, settings_, interval_s_))
       return match;
     const Prediction steady =
-        by_speed(track_, interval_s_, settings_.steady_m, settings_.steady_rad);
+        by_speed(track_, track_.stopped ? track_.believed->velocity : *track_.velocity,
+                 interval_s_, settings_.steady_m, settings_.steady_rad);
     const double away = sigmas_away(steady, match.reference_from_live);
     if (away <= kSteadySigmas)
       return match;
     PoseEstimate again = attempted(key, live_, settings_.match, stamp_ns_, &steady);
+    const double share = stops_at_once(match) ? settings_.braking_share : settings_.steady_share;
     const bool enough = inliers_of(again) >= settings_.min_inliers &&
-                        inliers_of(again) >= settings_.steady_share * inliers_of(match);
+                        inliers_of(again) >= share * inliers_of(match);
     return enough && sigmas_away(steady, again.reference_from_live) < away ? again : match;
   }
 
@@ -217,19 +228,84 @@ private:
     for (int axis = 0; axis < 3; ++axis)
       motion.covariance[7 * axis] += squared(left_m);
     motion.inliers = inliers_of(match);
-    track_.velocity.reset();
-    if (interval_s_ > 0) {
-      track_.velocity = logarithm(motion.prev_from_curr);
-      for (double &entry : *track_.velocity)
-        entry /= interval_s_;
-    }
+    track_.velocity = velocity_of(motion.prev_from_curr);
+    const bool stops = stops_at_once(motion.prev_from_curr);
+    if (stops)
+      allow_for_speed(motion);
+    else
+      believe(motion);
+    track_.stopped = stops || (track_.stopped && track_.believed);
     track_.stamp_ns = stamp_ns_;
     track_.keyframe_from_prev = keyframe_from_curr.pose;
     track_.covariance = keyframe_from_curr.covariance;
     track_.searched = keyframe_from_curr.searched;
-    if (has_moved_on(match))
+    if (stops) {
+      // What it left in the window would make the next frames rest, too.
+      track_.window = begin_window(live_, settings_, track_.window.offset_px);
+      begin_at_previous();
+    } else if (has_moved_on(match)) {
       keep_previous_as_keyframe();
+    }
     return motion;
+  }
+
+  // A vague step leaves what was believed before, as long as that counts.
+  void believe(const OdometryMotion &motion) {
+    const double step_m = norm(motion.prev_from_curr.translation);
+    double variance_m2 = 0;
+    for (int axis = 0; axis < 3; ++axis)
+      variance_m2 += motion.covariance[7 * axis];
+    if (!track_.velocity || (track_.believed && !counts(*track_.believed)))
+      track_.believed.reset();
+    if (!track_.velocity || variance_m2 > squared(kStoppedShare * step_m))
+      return;
+    track_.believed = {*track_.velocity, step_m, stamp_ns_};
+    track_.stopped = false;
+  }
+
+  bool counts(const BelievedSpeed &believed) const {
+    return seconds_between(believed.stamp_ns, stamp_ns_) <= settings_.disbelief_s;
+  }
+
+  // Tangent per second; none in no time.
+  std::optional<Tangent> velocity_of(const RigidTransform &prev_from_curr) const {
+    if (interval_s_ <= 0)
+      return std::nullopt;
+    Tangent velocity = logarithm(prev_from_curr);
+    for (double &entry : velocity)
+      entry /= interval_s_;
+    return velocity;
+  }
+
+  // The robot may have gone on at the last speed, too.
+  void allow_for_speed(OdometryMotion &motion) const {
+    const Vec3 &moved_m = motion.prev_from_curr.translation;
+    Vec3 further_m;
+    for (int i = 0; i < 3; ++i)
+      further_m[i] = track_.believed->velocity[i] * interval_s_ - moved_m[i];
+    for (int row = 0; row < 3; ++row)
+      for (int column = 0; column < 3; ++column)
+        motion.covariance[6 * row + column] += further_m[row] * further_m[column];
+  }
+
+  bool stops_at_once(const PoseEstimate &match) const {
+    return match.found &&
+           stops_at_once(compose(inverse(track_.keyframe_from_prev), match.reference_from_live));
+  }
+
+  // Whether a step is, or goes on with, a stop faster than any robot brakes.
+  bool stops_at_once(const RigidTransform &prev_from_curr) const {
+    const auto velocity = velocity_of(prev_from_curr);
+    if (!velocity || !track_.believed || !counts(*track_.believed))
+      return false;
+    const BelievedSpeed &believed = *track_.believed;
+    // A stamp that is wrong makes a step fast, not long.
+    const double was_m_s = std::min(left_of(believed.velocity, believed.velocity),
+                                    believed.step_m / interval_s_);
+    const double since_s = seconds_between(believed.stamp_ns, stamp_ns_);
+    const double braked_m_s = track_.stopped ? 0 : settings_.braking_m_s2 * since_s;
+    return was_m_s - left_of(believed.velocity, *velocity) >
+           std::max(kStoppedShare * was_m_s, braked_m_s);
   }
 
   bool has_moved_on(const PoseEstimate &match) const {
@@ -248,6 +324,11 @@ private:
 
   void keep_previous_as_keyframe() {
     keep_newest(track_.window, settings_);
+    begin_at_previous();
+  }
+
+  // The previous frame is the keyframe now.
+  void begin_at_previous() {
     track_.keyframe_from_prev = RigidTransform{};
     track_.covariance = {};
     track_.searched = {};

@@ -20,6 +20,7 @@ struct OdometrySettings {
   double acceleration_m_s2 = 0, angular_acceleration_rad_s2 = 0;
   double max_prediction_s = 0;
   double steady_m = 0, steady_rad = 0, steady_share = 0;
+  double braking_m_s2 = 0, braking_share = 0, disbelief_s = 0;
   double keyframe_flow_px = 0, keyframe_share = 0;
 };
 
@@ -51,6 +52,12 @@ struct OdometryWindow {
   double offset_px = 0;            // what the camera's disparities are too large by
 };
 
+struct BelievedSpeed {
+  std::array<double, 6> velocity; // tangent per second
+  double step_m;
+  int64_t stamp_ns; // of the frame in which its step ends
+};
+
 // An unbroken run of frames.
 struct OdometryTrack {
   OdometryWindow window;
@@ -59,6 +66,8 @@ struct OdometryTrack {
   std::array<double, 36> covariance{}; // of keyframe_from_prev
   std::array<double, 36> searched{};   // the same, as wide as matching searches
   std::optional<std::array<double, 6>> velocity; // tangent per second
+  std::optional<BelievedSpeed> believed; // of the last step that was neither vague nor stopped
+  bool stopped = false; // whether an impossible stop came since then
 };
 
 struct OdometryState {

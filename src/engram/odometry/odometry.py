@@ -88,6 +88,11 @@ class OdometryConfig:
             motions that landmarks agree on, the one within twice these needs only `steady_share`
             of the other's inliers: rain and lamps make a second motion.
         steady_share: see `steady_m`.
+        braking_m_s2: a step that takes more than half of the speed, faster than this since the last
+            step that was not vague, is an impossible stop. A car brakes with up to 8.
+        braking_share: what `steady_share` is against an impossible stop.
+        disbelief_s: so long after one the speed before it is still the last speed, and the step's
+            covariance holds both. No robot keeps its speed for much longer.
         keyframe_flow_px: a frame becomes a keyframe once its landmarks have moved this far in the
             image (median). Below it noise outweighs motion.
         keyframe_share: or once it shows less than this share of the keyframe's landmarks.
@@ -114,6 +119,9 @@ class OdometryConfig:
     steady_m: Annotated[float, Meta(gt=0)] = 0.05
     steady_rad: Annotated[float, Meta(gt=0)] = 0.01
     steady_share: Annotated[float, Meta(gt=0, le=1)] = 0.5
+    braking_m_s2: Annotated[float, Meta(gt=0)] = 10.0
+    braking_share: Annotated[float, Meta(gt=0, le=1)] = 0.3
+    disbelief_s: Annotated[float, Meta(ge=0)] = 2.0
     keyframe_flow_px: float = 10.0
     keyframe_share: float = 0.4
 
