@@ -18,6 +18,9 @@ isa: str
 def detect_corners(
     image: NDArray[np.uint8], threshold: int
 ) -> tuple[NDArray[np.int16], NDArray[np.uint8], NDArray[np.float32]]: ...
+def best_corners(
+    image: NDArray[np.uint8], threshold: int, cell_px: int, most: int
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]: ...
 def order_corners(
     positions: NDArray[np.int16], scores: NDArray[np.uint8], width: int, height: int, cell_px: int
 ) -> NDArray[np.int32]: ...

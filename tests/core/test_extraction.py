@@ -105,6 +105,20 @@ def test_order_takes_the_best_of_each_cell_in_turn() -> None:
     assert len(np.unique(first, axis=0)) == 40
 
 
+@pytest.mark.parametrize("most", [1, 60, 100_000])
+def test_best_corners_are_the_first_in_order(most: int) -> None:
+    image = np.random.default_rng(4).integers(0, 256, (150, 260), dtype=np.uint8)
+    positions, scores, offsets = _core.detect_corners(image, 30)
+    best = _core.order_corners(positions, scores, 260, 150, 32)[:most]
+    pixels, descriptors = _core.best_corners(image, 30, 32, most)
+    assert len(pixels) == min(most, len(positions)) > 0
+    np.testing.assert_array_equal(pixels, positions[best].astype(np.float64) + offsets[best])
+    described = _core.describe(_core.smooth(image), np.ascontiguousarray(positions[best]))
+    np.testing.assert_array_equal(descriptors, described)
+    flat, none = _core.best_corners(np.zeros((64, 64), np.uint8), 30, 32, most)
+    assert (flat.shape, none.shape) == ((0, 2), (0, 32))
+
+
 @pytest.mark.parametrize("shape", [(40, 97), (5, 5), (66, 200)])
 def test_smoothing_and_halving_equal_the_definition(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(8).integers(0, 256, shape, dtype=np.uint8)

@@ -14,7 +14,14 @@ from hypothesis import given
 
 from engram.doctor.checks import frames_late, scale_off, turn_ratio, upright
 from engram.doctor.examination import DoctorConfig, Evidence, Examination, Facts, Look, align
-from engram.doctor.table import CHECKS, Diagnosis, Finding, Severity, diagnose
+from engram.doctor.table import (
+    CHECKS,
+    Diagnosis,
+    Finding,
+    Severity,
+    diagnose,
+    fatal_findings,
+)
 from engram.frontend.features import SideMatches, match_sides
 from engram.frontend.frame import StereoPair
 from engram.geometry.cameras import StereoCamera
@@ -53,6 +60,7 @@ def examined(pairs: Sequence[StereoPair], facts: Facts | None = None) -> Diagnos
         if front.clock.take(pair.stamp_ns):
             front.take(pair)
     front.examination.evidence.taken = front.clock.report
+    assert front.unfit == front.diagnosis.fatal
     return front.diagnosis
 
 
@@ -248,6 +256,7 @@ def test_rows_that_are_misaligned_tell_no_lag() -> None:
         sound = matched(points)
         seen.matches.append((k, SideMatches(sound.pixels, sound.shift + np.array([0.0, 3.0]))))
     assert codes(diagnose(seen)) == {"rows_misaligned"}
+    assert [one.code for one in fatal_findings(seen)] == ["rows_misaligned"]
 
 
 @pytest.mark.parametrize(("sigma_m", "off"), [(0.02, 0.12), (0.3, None)])

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.builders import CAMERA, Seen, World, drive
 from tests.scenes import Scene
 
-from engram.doctor.examination import APART, MOST, Examination, Rematched
+from engram.doctor.examination import APART, FACTORS, MOST, Examination, Rematched
 from engram.doctor.table import Finding
-from engram.frontend.matching import MatcherConfig
+from engram.frontend.matching import Match, MatcherConfig, match_frames
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram.maps.map import open_map
@@ -120,6 +121,27 @@ def test_a_robot_that_localises_is_told_that_its_calibration_is_wrong(
 
 def test_of_a_right_calibration_it_hears_nothing(mapped: Path) -> None:
     assert not [one for one in localised_by(mapped, CAMERA) if one.code.endswith("_off")]
+
+
+def test_a_robot_matches_nothing_again_until_it_is_asked(
+    mapped: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[int] = []
+
+    def counted(*args: Any) -> Match:
+        made.append(1)
+        return match_frames(*args)
+
+    monkeypatch.setattr("engram.doctor.examination.match_frames", counted)
+    with open_map(mapped) as opened:
+        with opened.robot(CAMERA) as robot:
+            run(robot, drive(WORLD, ROAD + 0.3, seed=1, start_ns=10**15))
+        assert not made
+        assert not {"focal_length_off", "baseline_off"} & set(robot.diagnosis.untold)
+    matched = len(made)
+    assert matched >= 2 * len(FACTORS)
+    assert robot.diagnosis
+    assert len(made) == matched
 
 
 def test_only_so_many_frames_are_matched_again() -> None:

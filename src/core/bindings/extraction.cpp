@@ -111,6 +111,24 @@ auto detect_corners(const GreyImage &array, int threshold) {
                         engram::to_numpy(std::move(offsets), {count, 2}));
 }
 
+auto best_corners(const GreyImage &array, int threshold, int cell_px, int most) {
+  const Image image = view(array);
+  require_threshold(threshold);
+  require(cell_px >= 4 && most >= 1, "cell_px must be at least 4, most at least 1");
+  const auto room = static_cast<size_t>(most);
+  std::vector<double> pixels(2 * room);
+  std::vector<uint8_t> descriptors(32 * room);
+  size_t count;
+  {
+    nb::gil_scoped_release unlocked;
+    count = static_cast<size_t>(ENGRAM_CALL(best_corners, image, threshold, cell_px, most,
+                                            pixels.data(),
+                                            reinterpret_cast<uint64_t *>(descriptors.data())));
+  }
+  return nb::make_tuple(engram::to_numpy(std::move(pixels), {count, 2}),
+                        engram::to_numpy(std::move(descriptors), {count, 32}));
+}
+
 auto order_corners(const Positions &positions, const engram::Input<uint8_t, 1> &scores, int width,
                    int height, int cell_px) {
   require(positions.shape(0) == scores.shape(0), "positions and scores differ in number");
@@ -319,6 +337,8 @@ void bind_extraction(nb::module_ &module) {
   module.def("detect_corners", &detect_corners, "image"_a, "threshold"_a,
              "FAST-9 corners: positions (N, 2) int16 x, y in raster order, scores (N,) uint8, "
              "sub-pixel offsets (N, 2) float32.");
+  module.def("best_corners", &best_corners, "image"_a, "threshold"_a, "cell_px"_a, "most"_a,
+             "The first corners in their order: pixels (N, 2) float64, BRIEF-256 (N, 32) uint8.");
   module.def("order_corners", &order_corners, "positions"_a, "scores"_a, "width"_a, "height"_a,
              "cell_px"_a, "Indices (N,) int32: best corner of each cell first, then the second.");
   module.def("smooth", &smooth, "image"_a, "Binomial 5×5 blur; the outer two pixels are zero.");

@@ -154,6 +154,29 @@ ExtractionCounts look_at(const Look &look, const ExtractionSettings &settings,
 
 } // namespace
 
+int64_t best_corners(const Image &image, int threshold, int64_t cell_px, int64_t most,
+                     double *pixels, uint64_t *descriptors) {
+  static thread_local Workspace work;
+  Corner *corners = work.corners.room_for(most_corners(image.width, image.height));
+  uint8_t *scores = work.scores.room_for(score_stride(image.width) * image.height);
+  const int64_t count = detect_corners(image, threshold, corners, scores);
+  int32_t *order = work.order.room_for(count);
+  order_corners(corners, count, image, cell_px, order);
+  const int64_t best = std::min(count, most);
+  Corner *kept = work.kept.room_for(best);
+  for (int64_t i = 0; i < best; ++i) {
+    kept[i] = corners[order[i]];
+    float offset[2];
+    refine_corner(kept[i], scores, image.width, offset);
+    pixels[2 * i] = kept[i].x + static_cast<double>(offset[0]);
+    pixels[2 * i + 1] = kept[i].y + static_cast<double>(offset[1]);
+  }
+  uint8_t *smoothed = work.smoothed.room_for(image.width * image.height);
+  smooth(image, smoothed);
+  describe({smoothed, image.width, image.height}, kept, best, descriptors);
+  return best;
+}
+
 ExtractionCounts extract(const Image &left, const Image &right, const Mask &mask,
                          const ExtractionSettings &settings, const ExtractedLandmarks &out) {
   static thread_local Workspace work;

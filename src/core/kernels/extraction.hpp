@@ -46,4 +46,9 @@ ENGRAM_DECLARE_KERNELS(
     // other pairs get the same bits as without that. The mask tells what of the left image is not
     // to be asked whether they differ.
     ExtractionCounts extract(const Image &left, const Image &right, const Mask &mask,
-                             const ExtractionSettings &settings, const ExtractedLandmarks &out);)
+                             const ExtractionSettings &settings, const ExtractedLandmarks &out);
+
+    // The first `most` corners of an image in the order of order_corners(), with fractions of a
+    // pixel, and their descriptors of four words. Returns how many there are.
+    int64_t best_corners(const Image &image, int threshold, int64_t cell_px, int64_t most,
+                         double *pixels, uint64_t *descriptors);)

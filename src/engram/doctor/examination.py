@@ -42,39 +42,44 @@ _LEAST, _STANDS_OUT = 5, 6.0
 _GAIN, _MORE = 1.03, 1.0
 
 
-@dataclass(slots=True)
 class Rematched:
-    """Inliers of the frames that were matched again.
+    """Frames to be matched again by other calibrations, and the factors that this decides.
 
-    Attributes:
-        focal, baseline: (13,) int64: sums of their inliers if that is too large by `FACTORS`.
+    Each costs twice as many matches as there are `FACTORS`. They are made once a factor is asked
+    for, not while the robot drives.
     """
 
-    frames: int = 0
-    focal: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(FACTORS), np.int64))
-    baseline: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(FACTORS), np.int64))
+    def __init__(self) -> None:
+        self.frames = 0
+        self._waiting: list[tuple[Frame, Frame, MatcherConfig]] = []
+        # (13,) int64: sums of inliers if that is too large by `FACTORS`.
+        self._focal = np.zeros(len(FACTORS), np.int64)
+        self._baseline = np.zeros(len(FACTORS), np.int64)
 
     def add(self, reference: Frame, live: Frame, matcher: MatcherConfig) -> None:
-        """Matches one more live frame with a frame of the map that shows the same."""
-
-        def inliers(camera: StereoCamera) -> int:
-            seen = replace(live, camera=camera)
-            return match_frames(reference, seen, matcher, self.frames).inliers
-
-        camera = live.camera
-        self.focal += [inliers(_refocused(camera, by)) for by in FACTORS.tolist()]
-        self.baseline += [inliers(_rebased(camera, by)) for by in FACTORS.tolist()]
+        """Takes one more live frame with a frame of the map that shows the same."""
+        self._waiting.append((reference, live, matcher))
         self.frames += 1
+
+    def _match(self) -> None:
+        first = self.frames - len(self._waiting)
+        for seed, (reference, live, matcher) in enumerate(self._waiting, first):
+            for sums, changed in ((self._focal, _refocused), (self._baseline, _rebased)):
+                seen = (replace(live, camera=changed(live.camera, by)) for by in FACTORS.tolist())
+                sums += [match_frames(reference, one, matcher, seed).inliers for one in seen]
+        self._waiting.clear()
 
     @property
     def focal_factor(self) -> float | None:
         """Factor by which the focal length is too long; None if undetermined."""
-        return self._factor(self.focal, self.baseline)
+        self._match()
+        return self._factor(self._focal, self._baseline)
 
     @property
     def baseline_factor(self) -> float | None:
         """The same of the baseline."""
-        return self._factor(self.baseline, self.focal)
+        self._match()
+        return self._factor(self._baseline, self._focal)
 
     def _factor(self, inliers: NDArray[np.int64], other: NDArray[np.int64]) -> float | None:
         """Where the inliers are most; 1 where the calibration, or the other fault, fits better."""
@@ -462,7 +467,7 @@ class Examination:
         return few and self._unmatched >= APART and self._asked <= self.evidence.config.frames
 
     def match(self, reference: Frame, live: Frame, matcher: MatcherConfig) -> None:
-        """Matches a live frame again with a frame of the map that it matched best."""
+        """Takes a live frame and the frame of the map that it matched best."""
         self.evidence.rematched.add(reference, live, matcher)
         self._unmatched = 0
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -390,12 +390,25 @@ CHECKS: tuple[Check, ...] = (
 )  # fmt: skip
 
 
-def diagnose(seen: Evidence) -> Diagnosis:
-    """Runs all checks; consequences of a finding are left out."""
+# The checks on which fatal findings depend.
+_DECISIVE = tuple(
+    one
+    for one in CHECKS
+    if one.explains or one.code in {each.code for each in CHECKS if each.severity is _FATAL}
+)
+
+
+def fatal_findings(seen: Evidence) -> tuple[Finding, ...]:
+    """Those of `diagnose` that are fatal, without the checks that these do not depend on."""
+    return diagnose(seen, _DECISIVE).fatal
+
+
+def diagnose(seen: Evidence, made: Sequence[Check] = CHECKS) -> Diagnosis:
+    """Makes all checks, or some; consequences of a finding are left out."""
     found: list[Finding] = []
     explained: set[str] = set()
     untold: dict[str, str] = {}
-    for check in CHECKS if len(seen) or checks.faulty(seen) or seen.bad else ():
+    for check in made if len(seen) or checks.faulty(seen) or seen.bad else ():
         result = check.finding(seen)
         if result is None and check.needs:
             untold[check.code] = check.needs

@@ -389,7 +389,10 @@ class SideMatches:
 
 def match_sides(pair: StereoPair) -> SideMatches:
     """Mutually nearest corners of a pair, the wrong ones mostly removed."""
-    (left, of_left), (right, of_right) = _best_corners(pair.left), _best_corners(pair.right)
+    (left, of_left), (right, of_right) = (
+        _core.best_corners(image, _FAST_THRESHOLD, _CELL_PX, _CORNERS)
+        for image in (pair.left, pair.right)
+    )
     if min(len(left), len(right)) < 2:
         return SideMatches(np.zeros((0, 2)), np.zeros((0, 2)))
     bits = _core.hamming_matrix(of_left, of_right)
@@ -403,12 +406,3 @@ def match_sides(pair: StereoPair) -> SideMatches:
     pixels, shift = left[kept], left[kept] - right[nearest[kept]]
     near = np.abs(shift[:, 1] - np.median(shift[:, 1])) < _WRONG_PX if len(shift) else kept[:0]
     return SideMatches(pixels[near], shift[near])
-
-
-def _best_corners(image: NDArray[np.uint8]) -> tuple[Array, NDArray[np.uint8]]:
-    """The best corners of each cell, (N, 2) px, with their descriptors (N, 32)."""
-    positions, scores, offsets = _core.detect_corners(image, _FAST_THRESHOLD)
-    height, width = image.shape
-    best = _core.order_corners(positions, scores, width, height, _CELL_PX)[:_CORNERS]
-    described = _core.describe(_core.smooth(image), np.ascontiguousarray(positions[best]))
-    return positions[best].astype(np.float64) + offsets[best], described

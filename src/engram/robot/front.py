@@ -14,8 +14,8 @@ from typing import TypeAlias, TypeVar
 
 import numpy as np
 
-from engram.doctor.examination import Examination
-from engram.doctor.table import Diagnosis, diagnose
+from engram.doctor.examination import Evidence, Examination
+from engram.doctor.table import Diagnosis, Finding, diagnose, fatal_findings
 from engram.errors import IncompatibleError, InputError
 from engram.frontend.frame import Frame, FrameStatus, StereoPair
 from engram.frontend.frontend import Frontend, check_pair
@@ -109,12 +109,21 @@ class Front:
     @property
     def diagnosis(self) -> Diagnosis:
         """What the doctor finds in the first frames so far."""
-        evidence = self.examination.evidence
-        evidence.fixed_share, evidence.doubted = self._fixed.share, self._fixed.doubts
+        evidence = self._evidence()
         found = diagnose(evidence)
         if not self._fixed.share or evidence.camera is None:
             return found
         return replace(found, seen=self._fixed.mask(evidence.camera))
+
+    @property
+    def unfit(self) -> tuple[Finding, ...]:
+        """What is fatal of that; spares what takes the doctor longest."""
+        return fatal_findings(self._evidence())
+
+    def _evidence(self) -> Evidence:
+        evidence = self.examination.evidence
+        evidence.fixed_share, evidence.doubted = self._fixed.share, self._fixed.doubts
+        return evidence
 
     @property
     def fixed_share(self) -> float:

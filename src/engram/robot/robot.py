@@ -125,7 +125,7 @@ class Robot:
         """
         self._closed = True
         live, self._live = self._live, None
-        self.unfit = self.diagnosis.fatal
+        self.unfit = self._front.unfit
         try:
             if live is not None:
                 live.close(self.unfit)
@@ -397,7 +397,7 @@ class Robot:
                 arrived = replace(arrived, odometry=since)
         taken = self._front.take(arrived, motion, clock)
         if waits and examination.full:
-            self.unfit = self.diagnosis.fatal
+            self.unfit = self._front.unfit
             if self._live is not None:
                 self._result_sink = self._live.examined(self.unfit, self._result_sink)
         return taken
