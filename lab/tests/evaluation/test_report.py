@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -21,9 +22,11 @@ from engram_lab.studies.drives import DriveSet, EvaluatedDrive
 from engram_lab.studies.lockstep import Runs, only, read_runs, write_runs
 from engram_lab.studies.ranking_report import (
     POLICY_COLOURS,
+    ConfigurationResult,
     collect,
     draw_figures,
     labelled,
+    measure_rows,
     policy_rows,
     summary_rows,
     write_report,
@@ -136,6 +139,30 @@ def test_shares_are_those_that_were_made_up(rows) -> None:
     assert float(one_row(rows, policy="oracle")["share_not_localised"]) == 0
     assert float(row["excess_not_localised"]) == pytest.approx(0.15)
     assert float(row["median_error_m"]) == pytest.approx(0.02, abs=1e-6)
+
+
+def test_dry_and_wet_drives_stand_apart_by_every_estimator(plan: Plan, out: Path) -> None:
+    page = (out / "report.md").read_text()
+    head = "| policy | drives | P(> 10 m), route | P(> 10 m), gap | P(> 10 m), lost |"
+    assert head in page
+    assert f"| distance | {SESSIONS} dry |" in page  # names that say no weather
+    names = ["a-rain-b", *["a-clear-b"] * (SESSIONS - 1)]
+    drives = tuple(
+        replace(one, path=one.path.with_name(f"{name}-{k}.framelog"))
+        for k, (name, one) in enumerate(zip(names, plan.drives.drives, strict=True))
+    )
+    campaign = collect(plan)
+    named = {
+        one: ConfigurationResult(
+            one, [replace(each, name=drives[each.session].name) for each in result.sessions]
+        )
+        for one, result in campaign.memo.items()
+    }
+    found = measure_rows(replace(campaign, memo=named))
+    ours = {one["drives"]: one for one in found if one["policy"] == "distance"}
+    assert set(ours) == {"1 wet", f"{SESSIONS - 1} dry"}
+    assert ours["1 wet"]["share_not_localised"] == pytest.approx(0.15)
+    assert 0 < ours["1 wet"]["p_gt_10m_gap"] < ours["1 wet"]["p_gt_10m_lost"] <= 1
 
 
 def test_folds_have_rows_of_their_own(rows) -> None:
@@ -259,7 +286,11 @@ def test_the_page_shows_every_policy_and_the_sweeps(out: Path) -> None:
     for policy in MISSES:
         assert any(line.startswith(f"| {policy} | ") for line in lines)
     at = lines.index("Route not localised by the number of lanes")
-    (distance,) = [line for line in lines[:at] if line.startswith("| distance | ")]
+    (distance,) = [
+        line
+        for line in lines[:at]
+        if line.startswith("| distance | ") and not re.search(r"\| \d+ (dry|wet) \|", line)
+    ]
     assert " | 15.00 % (15.00 … 15.00) | " in distance
     assert lines[at + 2] == "| label | 1 | 2 | 8 | unlimited |"
     swept = lines[at : lines.index("", at + 2)]

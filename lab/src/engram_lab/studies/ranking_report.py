@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -71,7 +72,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionResult:
-    """One held-out session under one configuration."""
+    """One held-out session under one configuration.
+
+    Attributes:
+        name: of the drive, for people.
+    """
 
     session: int
     fold: int
@@ -85,6 +90,7 @@ class SessionResult:
     errors: PoseErrors
     step_ms: float
     in_force: Values
+    name: str = ""
 
     @property
     def frames(self) -> int:
@@ -165,9 +171,11 @@ class ConfigurationResult:
 
     def of_fold(self, fold: int) -> ConfigurationResult:
         """Only the sessions held out in one fold."""
-        return ConfigurationResult(
-            self.configuration, [one for one in self.sessions if one.fold == fold]
-        )
+        return self.where(lambda one: one.fold == fold)
+
+    def where(self, chosen: Callable[[SessionResult], bool]) -> ConfigurationResult:
+        """Only some of the sessions."""
+        return ConfigurationResult(self.configuration, list(filter(chosen, self.sessions)))
 
 
 @dataclass(frozen=True, eq=False)  # no slots: it remembers its draws
@@ -283,7 +291,10 @@ def collect(plan: Plan) -> CampaignResult:
                     if one not in wanted:
                         continue
                     nodes = _nodes(built, fold, one)
-                    result = session_result(runs, row, session, fold.number, nodes)
+                    result = replace(
+                        session_result(runs, row, session, fold.number, nodes),
+                        name=plan.drives.drives[session].name,
+                    )
                     found.setdefault(one, {})[session] = result
                 if mode == "memo":
                     laps += _lap(runs, plan.drives.drives[session].name)
@@ -383,6 +394,7 @@ def _over(above: float, below: float) -> float:
 
 
 _AT_M = (5.0, 10.0)
+_ESTIMATORS = (Estimator.ROUTE, Estimator.GAP, Estimator.LOST)
 _USUAL = {"mode": "memo", "fold": "all"}
 
 
@@ -407,6 +419,7 @@ def session_rows(campaign: CampaignResult) -> list[Row]:
     return [
         {
             "session": session.session,
+            "drive": session.name,
             **_row(
                 campaign,
                 mode,
@@ -487,6 +500,38 @@ def _beside_others(campaign: CampaignResult, result: ConfigurationResult) -> Row
         row["minus_distance"] = gap.estimate
         row |= {"minus_distance_low": gap.low, "minus_distance_high": gap.high}
     return row
+
+
+# Names of simulated drives say the weather; a road is wet in these.
+_WET = re.compile(r"-(rain|showers|damp|thaw)-")
+_MEASURES = {
+    "policy": "policy",
+    "drives": "drives",
+    **{f"p_gt_10m_{one.value}": f"P(> 10 m), {one.value}" for one in _ESTIMATORS},
+    "share_not_localised": "route not localised",
+}
+
+
+def measure_rows(campaign: CampaignResult) -> list[Row]:
+    """Every estimator of P(> 10 m) at the few lanes, on dry and on wet roads apart."""
+    kinds: list[tuple[str, Callable[[SessionResult], bool]]] = [
+        ("dry", lambda one: not _WET.search(one.name)),
+        ("wet", lambda one: bool(_WET.search(one.name))),
+    ]
+    rows = []
+    for policy in campaign.policies:
+        result = campaign.get(policy)
+        for kind, chosen_ones in kinds if result is not None else ():
+            assert result is not None
+            some = result.where(chosen_ones)
+            if some.sessions:
+                shares = {
+                    f"p_gt_10m_{one.value}": some.failure(10.0, one).value for one in _ESTIMATORS
+                }
+                missed = some.not_localised.value
+                row = {"policy": policy, "drives": f"{len(some.sessions)} {kind}"}
+                rows.append({**row, **shares, "share_not_localised": missed})
+    return rows
 
 
 def few_lanes_results(campaign: CampaignResult) -> list[ConfigurationResult]:
@@ -908,6 +953,7 @@ def _page(
         yield from (f"## {campaign.name}", "", *_left_out(campaign), _protocol(campaign), "")
         yield from _exceptions(campaign)
         yield from table(policy_rows(campaign, own), _POLICY_COLUMNS, beside)
+        yield from table(measure_rows(campaign), _MEASURES, beside)
         yield from table(chosen(comparisons, campaign=campaign.name), COMPARED, beside)
         for column, title in (
             ("share_not_localised", "Route not localised"),
