@@ -421,7 +421,7 @@ def test_an_arm_leaves_to_the_settings_what_it_does_not_set(drives, tmp_path: Pa
     (usual, as_published) = make_fleet_plan(
         drives, AllSettings(), replace(FLEET, arms=("A", "P")), tmp_path
     ).arms
-    assert (usual.merging.sure_inliers, as_published.merging.sure_inliers) == (60, 0)
+    assert (usual.merging.sure_inliers, as_published.merging.sure_inliers) == (45, 0)
 
 
 @pytest.fixture(scope="module")

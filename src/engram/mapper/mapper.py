@@ -468,7 +468,7 @@ class MapperConfig:
     ] = 1000
     save_every_m: Annotated[float, PUBLIC] = 1.0
     save_every_rad: Annotated[float, PUBLIC] = float(np.deg2rad(15.0))
-    sure_inliers: Annotated[int, PUBLIC] = 60
+    sure_inliers: Annotated[int, PUBLIC] = 45
     tie_within_m: float = 8.0
     checkpoint_every: Annotated[int, PUBLIC] = 20
     memory_bytes: int = 256_000_000

@@ -66,7 +66,7 @@ class MergeSettings:
         int,
         Meta(ge=0, description="inliers needed to drop a node; 0: any match. Source: [G16] §V-A"),
         PUBLIC,
-    ] = 60
+    ] = 45
     unit: Annotated[
         Unit,
         Meta(
