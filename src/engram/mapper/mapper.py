@@ -585,7 +585,7 @@ class Mapper(Memory):
         if saved is None:
             return result
         if self._loops is not None:
-            self._loops.ask(saved, live)
+            self._loops.ask(saved, replace(live, further=None))  # its images are not kept
         return replace(result, saved=saved.id)
 
     def withdrawn(self, result: Localisation) -> None:

@@ -147,6 +147,7 @@ class Front:
     def match_again(self, live: Frame, best: Callable[[], Frame | None]) -> None:
         """Shows the doctor a frame and what it matched best in a map, if it asks for that."""
         if self.examination.wants_match() and (reference := best()) is not None:
+            live = replace(live, further=None)  # the doctor keeps it, but not its images
             self.examination.match(reference, live, self._settings.localiser.matcher)
 
     def take_ahead(self, arrived: Arrived, outside: OutsideMotion | None = None) -> LoggedFrame:
