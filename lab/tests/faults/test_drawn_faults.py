@@ -298,7 +298,7 @@ def test_damaged_landmarks_are_met_and_no_place_is_claimed_by_them(
 def test_a_drive_is_mapped_on_into_a_copy_and_wrong_edges_are_counted(
     clip: Clip, tmp_path: Path
 ) -> None:
-    bright = [on_both(pair, lambda image: brightened(image, 2.0)) for pair in clip.pairs]
+    bright = [on_both(pair, lambda image: brightened(image, 3.0)) for pair in clip.pairs]
     later = [replace(pair, stamp_ns=pair.stamp_ns + 10**12) for pair in bright]
     live = Clip(clip.plan, later, clip.world_from_cam)
     trial, out = Trial(0, "none", "a", 0, 0.0), tmp_path / "mapped.engram"
