@@ -18,6 +18,9 @@ isa: str
 def detect_corners(
     image: NDArray[np.uint8], threshold: int
 ) -> tuple[NDArray[np.int16], NDArray[np.uint8], NDArray[np.float32]]: ...
+def equal_pixels(
+    now: NDArray[np.uint8], before: NDArray[np.uint8], black: int, white: int
+) -> tuple[int, int]: ...
 def best_corners(
     image: NDArray[np.uint8], threshold: int, cell_px: int, most: int
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]: ...

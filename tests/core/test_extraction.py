@@ -381,3 +381,15 @@ from tests.core.test_extraction import digest
 print(digest())
 """
     assert len(printed(code)) == 1
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 85), (40, 97)])
+def test_equal_pixels_are_counted_between_black_and_white(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(9)
+    now, other = rng.integers(0, 256, (2, *shape), dtype=np.uint8)
+    before = np.where(rng.random(shape) < 0.5, now, other)
+    tells = (now > 2) & (now < 253)
+    equal = np.count_nonzero(tells & (now == before))
+    assert _core.equal_pixels(now, before, 2, 253) == (np.count_nonzero(tells), equal)
+    with pytest.raises(ValueError, match="size"):
+        _core.equal_pixels(now, np.zeros((7, 7), np.uint8), 2, 253)

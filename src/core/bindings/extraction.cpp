@@ -13,6 +13,7 @@
 #include "kernels/corners.hpp"
 #include "kernels/pyramid.hpp"
 #include "kernels/quantise.hpp"
+#include "kernels/repeats.hpp"
 #include "kernels/sides.hpp"
 
 namespace nb = nanobind;
@@ -109,6 +110,18 @@ auto detect_corners(const GreyImage &array, int threshold) {
   return nb::make_tuple(engram::to_numpy(std::move(positions), {count, 2}),
                         engram::to_numpy(std::move(scores), {count}),
                         engram::to_numpy(std::move(offsets), {count, 2}));
+}
+
+auto equal_pixels(const GreyImage &now_array, const GreyImage &before_array, uint8_t black,
+                  uint8_t white) {
+  const Image now = view(now_array), before = view(before_array);
+  require_same_size(now, before);
+  engram::EqualPixels found;
+  {
+    nb::gil_scoped_release unlocked;
+    found = ENGRAM_CALL(equal_pixels, now, before, black, white);
+  }
+  return nb::make_tuple(found.telling, found.equal);
 }
 
 auto best_corners(const GreyImage &array, int threshold, int cell_px, int most) {
@@ -337,6 +350,8 @@ void bind_extraction(nb::module_ &module) {
   module.def("detect_corners", &detect_corners, "image"_a, "threshold"_a,
              "FAST-9 corners: positions (N, 2) int16 x, y in raster order, scores (N,) uint8, "
              "sub-pixel offsets (N, 2) float32.");
+  module.def("equal_pixels", &equal_pixels, "now"_a, "before"_a, "black"_a, "white"_a,
+             "Pixels between black and white, and how many of them are equal.");
   module.def("best_corners", &best_corners, "image"_a, "threshold"_a, "cell_px"_a, "most"_a,
              "The first corners in their order: pixels (N, 2) float64, BRIEF-256 (N, 32) uint8.");
   module.def("order_corners", &order_corners, "positions"_a, "scores"_a, "width"_a, "height"_a,

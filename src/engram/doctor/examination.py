@@ -485,8 +485,8 @@ class Examination:
         self.evidence.looks.append(
             Look(
                 (float(small[0].mean()), float(small[1].mean())),
-                max(float((one >= _WHITE).mean()) for one in small),
-                max(float((one <= _BLACK).mean()) for one in small),
+                max(np.count_nonzero(one >= _WHITE) / one.size for one in small),
+                max(np.count_nonzero(one <= _BLACK) / one.size for one in small),
                 (False, False) if last is None else self._repeats(small, last),
                 (float(small[0].std()), float(small[1].std())),
                 np.array([one[::_STEP].mean(1, np.float32) for one in (pair.left, pair.right)]),

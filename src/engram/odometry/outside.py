@@ -25,6 +25,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from engram import _core
 from engram.config import check_bounds
 from engram.frontend.frame import StereoPair
 from engram.geometry.se3 import SE3
@@ -476,11 +477,8 @@ def equal_share(now: NDArray[np.uint8], before: NDArray[np.uint8]) -> float:
     Returns:
         The share; 0 where the picture is too dark or too bright to decide.
     """
-    tells = (now > _BLACK) & (now < _WHITE)
-    count = np.count_nonzero(tells)
-    if count < _LEAST * now.size:
-        return 0.0
-    return np.count_nonzero(tells & (now == before)) / count
+    telling, equal = _core.equal_pixels(now, before, _BLACK, _WHITE)
+    return 0.0 if telling < _LEAST * now.size else equal / telling
 
 
 class StandsStill:

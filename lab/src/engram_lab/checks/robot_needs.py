@@ -1,11 +1,12 @@
 """What a robot needs: processor time of a step, on each instruction set, and memory.
 
     python -m engram_lab.checks.robot_needs
+    python -m engram_lab.checks.robot_needs --one 512 --doctor
 
 Every third frame of KITTI 06 is mapped. Six robots with default settings, each lost at first, then
 drive the clip in that map, at KITTI's size and at 512×384. Processor time is that of all threads of
 the process, which a busy machine changes little: H frames a second take H times the mean. The
-doctor is off: it looks at the first frames of a drive only, and here they would be all.
+doctor is off unless asked for: it looks at the first frames of a drive only, here at all of them.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _MAPPED = 3  # every so many frames are the map
 _ROBOTS = 6
 
 
-def measured(pairs: Sequence[StereoPair]) -> Iterator[Figure]:
+def measured(pairs: Sequence[StereoPair], *, doctor: bool = False) -> Iterator[Figure]:
     """Localised share, processor time a step in ms, and the process's largest memory in MB."""
     with tempfile.TemporaryDirectory(prefix="engram-needs-") as folder:
         path = Path(folder) / "street.engram"
@@ -50,7 +51,8 @@ def measured(pairs: Sequence[StereoPair]) -> Iterator[Figure]:
         taken = []
         localised = 0
         settings = Settings()
-        settings = replace(settings, doctor=replace(settings.doctor, frames=0))
+        if not doctor:
+            settings = replace(settings, doctor=replace(settings.doctor, frames=0))
         with open_map(path) as opened:
             for _ in range(_ROBOTS):
                 with opened.robot(pairs[0].camera, settings) as robot:
@@ -75,9 +77,11 @@ def main() -> None:
     """Measures each instruction set in a process of its own."""
     parser = command_line(__doc__)
     parser.add_argument("--one", choices=SIZES, help="measure this size in this process alone")
+    parser.add_argument("--doctor", action="store_true", help="with --one: leave the doctor on")
     asked = parser.parse_args()
     if asked.one:
-        report(measured(load_bench_data().at(asked.one)), asked.json, title=asked.one)
+        pairs = load_bench_data().at(asked.one)
+        report(measured(pairs, doctor=asked.doctor), asked.json, title=asked.one)
         return
     sets = _INSTRUCTION_SETS if _core.isa in _INSTRUCTION_SETS else (_core.isa,)
     for isa in sets[: sets.index(_core.isa) + 1]:
