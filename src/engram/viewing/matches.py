@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -28,8 +29,8 @@ from engram.untrusted import printable
 from engram.viewing.moments import moment
 from engram.viewing.pictures import Image, match_picture, with_caption
 
-# Mean difference of grey levels up to which two small pictures are of one image.
-_SAME_IMAGE = 6.0
+# Correlation from which on two small pictures of one stamp are of one image, however exposed.
+_SAME_IMAGE = 0.9
 # Drives next to one that are searched for the images of a map's nodes.
 _NEIGHBOURS = 20
 # A turn, and an offset to the side, that a caption mentions.
@@ -84,11 +85,13 @@ def _image_drives(folder: Path) -> Iterable[ImageSequence]:
 
 
 def shows(image: Image, small: Image) -> bool:
-    """Whether a small picture is of an image, both (h, w) uint8, but for its compression."""
+    """Whether a small picture is of an image, both (h, w) uint8, however exposed."""
     reduced = make_thumbnail(image)
     if reduced.shape != small.shape:
         return False
-    return float(np.abs(reduced.astype(float) - small).mean()) <= _SAME_IMAGE
+    one, other = (side.astype(np.float64) - side.mean() for side in (reduced, small))
+    scale = np.sqrt((one**2).sum() * (other**2).sum())
+    return bool(scale > 0 and (one * other).sum() >= _SAME_IMAGE * scale)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,13 +101,14 @@ class ShownMatch:
     Attributes:
         frame: its number.
         at_m: distance driven by then, metres.
-        picture: (h, w, 3) uint8 BGR, both images with what they share.
+        draw: makes the picture while the map is open, (h, w, 3) uint8 BGR: both images with what
+            they share.
         caption, details: two sentences about it.
     """
 
     frame: int
     at_m: float
-    picture: Image
+    draw: Callable[[], Image]
     caption: str
     details: str
 
@@ -132,27 +136,25 @@ class MatchShower:
         tried = [one for one in seen.outcomes if not one.damaged]
         success = outcome_at(seen.outcomes, found.node)
         best = success or max(tried, key=lambda one: (one.match.inliers, -one.rank), default=None)
-        live = self._live(seen)
-        if best is None or live is None:
+        pictured = isinstance(seen.arrived, StereoPair) or seen.frame.thumbnail is not None
+        if best is None or not pictured:
             return None
         node = self._graph.node(self._graph.index(best.candidate.node))
         mapped = self._opened.sessions.get(node.session, self._session)
-        image = self._of_node(best, node.stamp_ns, live.shape)
         then, now = moment(mapped, node.stamp_ns), moment(self._session, found.stamp_ns)
         return ShownMatch(
             frame,
             at_m,
-            self._picture(seen, best, image, live, (f"map: {then}", f"drive: {now}")),
+            partial(self._picture, seen, best, node.stamp_ns, (f"map: {then}", f"drive: {now}")),
             f"{then} → {now}, {_sentence(best, matched=success is not None)}",
             _details(seen, found, best, (mapped.robot, self._session.robot)),
         )
 
-    def _live(self, seen: LastFrame) -> Image | None:
+    def _live(self, seen: LastFrame) -> Image:
         if isinstance(seen.arrived, StereoPair):
             return seen.arrived.left
         small = seen.frame.thumbnail
-        if small is None:
-            return None
+        assert small is not None
         whole = self._images.find(seen.frame.stamp_ns, small)
         return small if whole is None else whole
 
@@ -165,8 +167,10 @@ class MatchShower:
         return np.zeros(shape, np.uint8)
 
     def _picture(
-        self, seen: LastFrame, best: Outcome, image: Image, live: Image, names: tuple[str, str]
+        self, seen: LastFrame, best: Outcome, stamp_ns: int, names: tuple[str, str]
     ) -> Image:
+        live = self._live(seen)
+        image = self._of_node(best, stamp_ns, live.shape)
         node = self._opened.frames.frame(best.candidate.node)
         size = np.array([node.camera.width, node.camera.height], dtype=np.float32)
         scale = np.float32(live.shape[1] / seen.frame.camera.width)
@@ -231,6 +235,6 @@ class PictureWriter:
         if shown is None:
             return
         path = self._folder / f"{frame:06d}_{found.status.value}.png"
-        picture = with_caption(shown.picture, f"{shown.caption}; {shown.details}")
+        picture = with_caption(shown.draw(), f"{shown.caption}; {shown.details}")
         if not cv2.imwrite(str(path), picture):
             raise InputError(f"{path}: the picture cannot be written; is the disk full?")

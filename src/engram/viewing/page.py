@@ -60,7 +60,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], caption: str) -
     body = "".join(row(cells, "td") for cells in rows)
     top = row(head, "th", ' scope="col"')
     return (
-        f'<div class="wide" tabindex="0" role="region" aria-label="{text(caption)}">'
+        f'<div class="wide" tabindex="0" role="group" aria-label="{text(caption)}">'
         f"<table><caption>{text(caption)}</caption>"
         f"<thead>{top}</thead><tbody>{body}</tbody></table></div>"
     )
@@ -69,7 +69,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]], caption: str) -
 def drawing(svg: str, caption: str) -> str:
     """A drawing of `engram.viewing.drawings.as_svg`, which has its own text for the blind."""
     return (
-        f'<figure><div class="wide" tabindex="0" role="region" aria-label="{text(caption)}">'
+        f'<figure><div class="wide" tabindex="0" role="group" aria-label="{text(caption)}">'
         f"{svg}</div><figcaption>{text(caption)}</figcaption></figure>"
     )
 

@@ -57,11 +57,10 @@ _NO_STATUS = {LocalisationStatus.LOST, LocalisationStatus.DEAD_RECKONING}
 
 @dataclass(frozen=True, slots=True)
 class _Kept:
-    """A match worth showing: how much so, and as a JPEG."""
+    """A match worth showing, and how much so."""
 
     score: float
     shown: ShownMatch
-    jpeg: bytes
 
 
 @dataclass(slots=True)
@@ -80,7 +79,7 @@ class _Shelf:
     def put(self, score: float, shown: ShownMatch) -> None:
         """Keeps a match, in place of those near it and beyond the last."""
         apart = [one for one in self.kept if abs(one.shown.at_m - shown.at_m) >= _APART_M]
-        apart.append(_Kept(score, shown, as_jpeg(shown.picture)))
+        apart.append(_Kept(score, shown))
         self.kept = sorted(apart, key=lambda one: -one.score)[:_PICTURES]
 
 
@@ -105,7 +104,7 @@ class Showcase:
                 shelf.put(score, shown)
 
     def section(self) -> list[str]:
-        """The part of a page that shows them."""
+        """The part of a page that shows them, while the map is open."""
         parts = [heading("Matches")]
         shelves = (
             ("Best: most inliers", self.best),
@@ -121,7 +120,7 @@ class Showcase:
             for one in sorted(kept, key=lambda one: one.shown.frame):
                 place = f"frame {one.shown.frame}, {one.shown.at_m:.0f} m into the drive"
                 details = f"{place}; {one.shown.details}"
-                parts.append(photograph(one.jpeg, one.shown.caption, details))
+                parts.append(photograph(as_jpeg(one.shown.draw()), one.shown.caption, details))
         if len(parts) == 1:
             parts.append(paragraph("No picture: the frames have no images, or none was attempted."))
         else:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
+import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,9 +29,10 @@ def demo(
     ] = 2,
     as_json: options.Json = False,
 ) -> None:
-    """Drive a small simulated town with two robots.
+    """Drive a small simulated town with three robots.
 
-    Five drives make a map; a sixth is localised in it on a tight budget.
+    Two robots map it and hand in their maps; a later drive by night and a third robot are localised
+    with what they share. Writes DIR/report.html, and opens it where there is a screen.
 
     \b
     Examples:
@@ -50,35 +53,25 @@ def _show(report: DemoReport) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from engram_lab.demo.story import INTRODUCTION
+
     console = Console(file=drawing(sys.stdout))
-    grown = Table("drive", title="The map grows where a place is new or looks different")
-    for column in ("localised", "new nodes"):
-        grown.add_column(column, justify="right")
-    for condition, mapped in zip(report.conditions, report.mapped, strict=False):
-        share = mapped.to_dict()["share_localised"]
-        grown.add_row(condition, f"{share:.0%}", str(mapped.saved))
-    console.print(grown)
-    found = Table("policy", title=f"Then: {report.conditions[-1]}")
-    for column in ("attempts allowed", "made a frame", "localised", "longest gap, m"):
-        found.add_column(column, justify="right")
-    for policy, summaries in report.localised.items():
-        for most, summary in summaries.items():
-            found.add_row(
-                policy,
-                str(most),
-                f"{summary['attempts_per_frame']:.2f}",
-                f"{summary['share_localised']:.0%}",
-                f"{summary['longest_gap_m']:.1f}",
-            )
-    console.print(found)
+    console.print(INTRODUCTION)
+    for one in report.tables():
+        console.print(f"\n{one.title}: {one.about}")
+        shown = Table(*one.head)
+        for row in one.rows:
+            shown.add_row(*row)
+        console.print(shown)
     console.print(
-        f"Pictures are in {report.out}. one_place.png: the same place in six conditions. "
-        "matches_path-near_4/: map node left, live image right, matched landmarks joined. "
-        "map_from_above.png: the drives that saved each part. attempts.png: attempts per frame.\n"
-        "`distance` tries the nearest node first. `path-near` first tries nodes that earlier "
-        "drives used together with the latest matches; the more experiences a place has, the "
-        "more attempts that saves."
+        f"{report.sharing()}\n`distance` tries the nearest node first. `recall`, the default, "
+        "first tries nodes of experiences that served before where the latest matches did.\n"
+        f"Look at {report.page}: the tables, the place in six conditions, and the later drives' "
+        "matches as pictures."
     )
+    has_screen = sys.platform == "darwin" or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
+    if sys.stdout.isatty() and has_screen:
+        webbrowser.open(report.page.resolve().as_uri())
 
 
 def simulate(
