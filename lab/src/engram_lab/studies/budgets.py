@@ -262,9 +262,7 @@ def in_a_sentence(cells: Sequence[Row]) -> str:
     if not better:
         said = f"`{OURS}` is shown to be better than `{BASELINE}` in none of {len(tested)} cells"
     else:
-        sizes = [one for row in cells if (one := row["experiences"]) != "all"]
-        order = [*sorted(set(sizes), key=int), "all"]
-        first = min(better, key=lambda row: (order.index(row["experiences"]), int(row["attempts"])))
+        first = min(better, key=lambda row: (_order(row["experiences"]), _order(row["attempts"])))
         finite = [row for row in better if row["ratio"] is not None]
         best = max(finite, key=lambda row: row["ratio"], default=first)
         said = (
@@ -303,13 +301,19 @@ def in_short(table_of_cells: Path) -> Iterator[str]:
 def _pivot(cells: Sequence[Row], across: str, marks: bool) -> list[Row]:
     """Policies and sizes by attempts or by time; a star where Holm's method shows a difference."""
     found: dict[tuple[str, str], Row] = {}
-    for row in cells:
+    for row in sorted(cells, key=lambda one: (_order(one["experiences"]), _order(one[across]))):
         key = row["experiences"], row["policy"]
         line = found.setdefault(key, {"experiences": key[0], "policy": key[1]})
-        shown = f"{100 * row['p_gt_10m']:.2f} %"
         verdict = row.get("against_distance", "") if marks else ""
-        line[str(row[across])] = shown + {"better": " *", "worse": " (worse *)"}.get(verdict, "")
-    return list(found.values())
+        mark = {"better": " *", "worse": " (worse *)"}.get(verdict, "")
+        line[str(row[across])] = f"{100 * row['p_gt_10m']:.2f} %{mark}"
+    # What has fewest columns last: those that come first give a table its order.
+    return sorted(found.values(), key=lambda line: (_order(line["experiences"]), -len(line)))
+
+
+def _order(value: Any) -> float:
+    """Numbers as they are, "all" and "unlimited" behind them."""
+    return float("inf") if str(value).isalpha() else float(value)
 
 
 def write_budgets(out: Path, plans: Sequence[Plan]) -> list[Path]:
