@@ -20,7 +20,6 @@ from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from engram.counts import counted
 from engram.errors import InputError, extra
@@ -547,6 +546,8 @@ def draw_strip(course: Course) -> Any:
 
 def draw_course(parts: MapParts, course: Course) -> Any:
     """A map from above in grey, and over it where a drive was localised."""
+    from scipy.spatial import cKDTree  # verbs that draw nothing import this module, too
+
     known = np.asarray(np.isfinite(course.places_m).all(axis=1), bool)
     of = np.full(len(known), -1, np.int64)
     if len(parts.part) and known.any():
