@@ -39,7 +39,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def shown(frame: int, at_m: float) -> ShownMatch:
-    return ShownMatch(frame, at_m, lambda: np.zeros((4, 4, 3), np.uint8), "", "")
+    return ShownMatch(frame, (0, 0), at_m, lambda: np.zeros((4, 4, 3), np.uint8), "", "")
 
 
 def test_the_pictures_of_a_page_lie_apart_and_are_the_best() -> None:

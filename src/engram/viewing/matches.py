@@ -100,6 +100,7 @@ class ShownMatch:
 
     Attributes:
         frame: its number.
+        stamps_ns: of the node and of the frame.
         at_m: distance driven by then, metres.
         draw: makes the picture while the map is open, (h, w, 3) uint8 BGR: both images with what
             they share.
@@ -107,6 +108,7 @@ class ShownMatch:
     """
 
     frame: int
+    stamps_ns: tuple[int, int]
     at_m: float
     draw: Callable[[], Image]
     caption: str
@@ -144,6 +146,7 @@ class MatchShower:
         then, now = moment(mapped, node.stamp_ns), moment(self._session, found.stamp_ns)
         return ShownMatch(
             frame,
+            (node.stamp_ns, found.stamp_ns),
             at_m,
             partial(self._picture, seen, best, node.stamp_ns, (f"map: {then}", f"drive: {now}")),
             f"{then} → {now}, {_sentence(best, matched=success is not None)}",

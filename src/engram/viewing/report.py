@@ -103,6 +103,11 @@ class Showcase:
             for shelf, score in wanted:
                 shelf.put(score, shown)
 
+    def stamps_ns(self) -> set[int]:
+        """Of all images that `section` shows, ns."""
+        shelves = self.best, self.weakest, self.failed
+        return {one for shelf in shelves for kept in shelf.kept for one in kept.shown.stamps_ns}
+
     def section(self) -> list[str]:
         """The part of a page that shows them, while the map is open."""
         parts = [heading("Matches")]

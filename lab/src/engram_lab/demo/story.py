@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from pathlib import Path
@@ -211,14 +211,23 @@ class Rendered:
         self._at = {
             drive.stamp_ns(frame): (drive, frame) for drive in drives for frame in range(len(drive))
         }
+        self._kept: dict[int, Image] = {}
+
+    def prepare(self, stamps_ns: Iterable[int]) -> None:
+        """Renders images drive by drive: the town is built again wherever the drive changes."""
+        for stamp_ns in sorted(stamps_ns):
+            self._image(stamp_ns)
+
+    def _image(self, stamp_ns: int) -> Image | None:
+        if stamp_ns not in self._kept and stamp_ns in self._at:
+            drive, frame = self._at[stamp_ns]
+            self._kept[stamp_ns] = next(iter(drive.frames(frame, frame + 1))).left
+        return self._kept.get(stamp_ns)
 
     def find(self, stamp_ns: int, small: Image) -> Image | None:
         """See `engram.viewing.matches.Images`."""
-        if stamp_ns not in self._at:
-            return None
-        drive, frame = self._at[stamp_ns]
-        image = next(iter(drive.frames(frame, frame + 1))).left
-        return image if shows(image, small) else None
+        image = self._image(stamp_ns)
+        return image if image is not None and shows(image, small) else None
 
 
 def run_demo(out: Path, monitor: Monitor = QUIET, workers: int = 2) -> DemoReport:
@@ -322,6 +331,7 @@ class _Run:
                     showcase.see(robot.last, found, frame, at_m)
             summary = summarise(results)
             if shown:
+                self.images.prepare(showcase.stamps_ns())
                 log = self.sequence.path
                 whole = {"map": self.map_path.name, "drive": self.about, "summary": summary,
                          "frames": records.frames(results)}  # fmt: skip
