@@ -52,6 +52,7 @@ def test_the_drives_that_ship_are_whole_and_small() -> None:
         (0.0, 90, 0, True, "empty"),
         (1.0, 0, 0, False, "nothing new"),
         (0.95, 80, 75, False, "weakly"),
+        (0.82, 74, 60, False, "weakly"),
         (0.2, 90, 5, False, "an experience of its own"),
         (0.8, 30, 5, False, ""),
     ],

@@ -101,7 +101,7 @@ def _why(share: float, saved: int, weak: int, *, first: bool) -> str:
         return "the robot's map was empty: all of it is new"
     if not saved:
         return "nothing new"
-    if share >= 0.9 and weak > saved / 2:
+    if weak > saved / 2:
         return "recognised, but weakly in this light: kept for the next drive like it"
     if share < 0.7:
         return "much of it looks unlike every drive before: an experience of its own"
