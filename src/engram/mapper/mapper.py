@@ -462,7 +462,7 @@ class MapperConfig:
             description="most landmarks of a saved node in a 512×384 image, scaled as "
             "frontend.landmarks: those of the live frame and the next ones, so that a frame in "
             "rain or at night finds more of its own there; 0: those of the live frame. "
-            "Source: lab/reports/constants.md",
+            "Source: lab/reports/conditions.md",
         ),
         PUBLIC,
     ] = 1000
