@@ -162,7 +162,7 @@ def _after_localising(
 
 
 def unmatched(frames: Sequence[Mapping[str, Any]]) -> int | None:
-    """A frame that no node matched, in the middle of all such; None if there is none."""
+    """The middle one of the frames that no node matched; None if there is none."""
     missed = [
         number
         for number, frame in enumerate(frames)

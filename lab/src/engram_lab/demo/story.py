@@ -53,8 +53,8 @@ _SPACING_M = 1.4
 _SHOWN_AT = 0.35
 INTRODUCTION = (
     "wildcat, courier and scout are robots with stereo cameras, in a simulated hamlet. wildcat and "
-    "courier each map their drives; both hand in their maps; courier by night and scout, which has "
-    "never been here, then drive with what the fleet shares."
+    "courier each map their drives and hand in their maps. Then courier drives by night, and "
+    "scout, which has never been here, by day, both with the map that the fleet shares."
 )
 
 
