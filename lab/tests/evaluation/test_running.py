@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from lab.tests.evaluation.campaigns import few_options, write_campaign
 from tests.builders import World, drive
 from tests.maps import maps
+from tests.sequences.test_framelog import write_ranked
 
 from engram.errors import ConfigError, MapError, MapLockedError, SequenceError, WorkerError
 from engram.frontend.matching import MatcherConfig
@@ -30,10 +31,20 @@ from engram.localiser.attempts import Lanes
 from engram.maps.map import open_map
 from engram.monitor import QUIET
 from engram.robot.settings import RobotOptions, Settings
+from engram.sequences.framelog.reader import FrameLog
 from engram_lab.studies import building, running
 from engram_lab.studies.building import build_map, true_nodes
 from engram_lab.studies.configurations import EVERYTHING, UNLIMITED, Configuration, sweep
-from engram_lab.studies.drives import DriveSet, KeptMaps, TrueNodes, drives_of, open_campaign, split
+from engram_lab.studies.drives import (
+    DriveSet,
+    KeptMaps,
+    TrueNodes,
+    drives_of,
+    open_campaign,
+    seen_by,
+    split,
+)
+from engram_lab.studies.in_force import check_logs
 from engram_lab.studies.lockstep import MatchMemo, read_runs
 from engram_lab.studies.plan import Task, alone_in, run_tasks
 from engram_lab.studies.ranking_report import write_report
@@ -329,6 +340,28 @@ def test_bad_truth_is_told_before_anything_is_built(tmp_path: Path) -> None:
     truth_path(drives.drives[1].path).write_text("1.0 2.0 three\n")
     with pytest.raises(SequenceError, match=r"001\.truth\.txt"):
         drives_of([one.path for one in drives.drives])
+
+
+def test_settings_may_ask_for_fewer_landmarks_than_logs_keep(tmp_path: Path) -> None:
+    few = replace(Settings(), frontend=replace(Settings().frontend, landmarks=4))
+    ranked = DriveSet("ranked", drives_of([write_ranked(tmp_path / "a.framelog")]))
+    seen = seen_by(ranked, few)
+    counts = [
+        [len(one.frame.landmarks) for one in log.drives[0].frames()] for log in (seen, ranked)
+    ]
+    wanted = [len(one.frame.landmarks) for one in FrameLog(ranked.drives[0].path, landmarks=4)]
+    assert counts[0] == wanted != counts[1]
+    check_logs(few, seen)
+    with pytest.raises(ConfigError, match=r"frontend\.landmarks is 4"):
+        check_logs(few, ranked)
+    assert seen_by(ranked, Settings()) is ranked
+    with pytest.raises(ConfigError, match="which come first"):
+        seen_by(write_campaign(tmp_path / "logs", (0,)), few)
+
+
+def test_a_study_may_take_the_first_drives_of_a_campaign(tmp_path: Path) -> None:
+    with pytest.raises(SequenceError, match="2 of 2 sessions are not rendered"):
+        open_campaign("hamlet", tmp_path, first=2)
 
 
 def test_what_cannot_be_evaluated_is_refused(tmp_path: Path) -> None:

@@ -55,6 +55,16 @@ class _Study:
     size: Annotated[
         str, typer.Option("--size", metavar="SIZE", help="Of campaigns: standard or full.")
     ] = "standard"
+    first: Annotated[
+        int | None,
+        typer.Option(
+            "--first",
+            metavar="N",
+            min=2,
+            help="Only the first N drives of each campaign.",
+            hidden=True,
+        ),
+    ] = None
     folds: Annotated[
         int,
         typer.Option(
@@ -106,7 +116,7 @@ class _Study:
     def drive_sets(self, settings: Settings) -> list[DriveSet]:
         """Each name of a campaign is one; all frame logs together are one."""
         from engram.errors import ConfigError
-        from engram_lab.studies.drives import DriveSet, drives_of, open_campaign
+        from engram_lab.studies.drives import DriveSet, drives_of, open_campaign, seen_by
         from engram_lab.town.campaigns import Size
         from engram_lab.town.simulating import campaigns_folder
 
@@ -115,10 +125,11 @@ class _Study:
             raise ConfigError(f"campaign {twice[0]!r} is given twice; give it once")
         logs = [Path(one) for one in self.drives if one not in names]
         folder = self.campaigns or campaigns_folder()
-        sets = [open_campaign(name, folder, Size.named(self.size), settings) for name in names]
+        size = Size.named(self.size)
+        sets = [open_campaign(name, folder, size, settings, self.first) for name in names]
         if logs:
             sets.append(DriveSet.of(drives_of(logs)))
-        return sets
+        return [seen_by(one, settings) for one in sets]
 
     @property
     def chosen_folds(self) -> tuple[int, ...]:

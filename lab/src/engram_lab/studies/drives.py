@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from engram.config import config_hash
 from engram.errors import ConfigError, SequenceError
 from engram.frontend.frame import DescriptorKind, FrameStatus
+from engram.frontend.frontend import FrontendConfig
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram.graph.basin import DEFAULT_RADIUS_M
@@ -145,16 +147,24 @@ class DriveSet:
 
 
 def open_campaign(
-    text: str, campaigns: Path, size: Size = Size.STANDARD, settings: Settings | None = None
+    text: str,
+    campaigns: Path,
+    size: Size = Size.STANDARD,
+    settings: Settings | None = None,
+    first: int | None = None,
 ) -> DriveSet:
-    """A rendered campaign, by ``NAME`` or ``NAME@SEED`` of its town."""
+    """A rendered campaign, by ``NAME`` or ``NAME@SEED`` of its town.
+
+    Args:
+        first: only so many drives, the earliest; None for all.
+    """
     name, _, seed = text.partition("@")
     try:
         number = int(seed or 1)
     except ValueError:
         raise ConfigError(f"campaign {text!r}: the seed after @ must be a whole number") from None
     campaign = campaign_named(name, number, size)
-    paths = campaign_logs(campaign, campaigns)
+    paths = campaign_logs(campaign, campaigns)[:first]
     missing = [path for path in paths if not path.exists()]
     if missing:
         raise SequenceError(
@@ -167,7 +177,32 @@ def open_campaign(
     same = [one.path for one in drives if one.frontend in ours]
     if {bring_up_to_date(path, settings) for path in same} - {Upkeep.KEPT}:
         drives = drives_of(paths)
-    return DriveSet(text, tuple(replace(one, world=WORLD_VERSION) for one in drives))
+    name = text if first is None else f"{text} (first {len(paths)})"
+    return DriveSet(name, tuple(replace(one, world=WORLD_VERSION) for one in drives))
+
+
+def seen_by(drives: DriveSet, settings: Settings) -> DriveSet:
+    """The drives, each frame with as many landmarks as the settings ask for.
+
+    Logs keep more of them than the front-end asks for, in its order: the first are to the bit those
+    of a front-end that asks for no more.
+
+    Raises:
+        ConfigError: other than the usual number is asked for, and a log keeps no order of them.
+    """
+    wanted = settings.frontend.landmarks
+    if wanted == FrontendConfig().landmarks:
+        return drives
+    seen = tuple(replace(one, landmarks=wanted) for one in drives.drives)
+    for drive in seen:
+        with closing(drive.log()) as log:
+            found = len(log.read(0).frame.landmarks)
+        if found > wanted:
+            raise ConfigError(
+                f"frontend.landmarks is {wanted}, and {drive.path} keeps {found} without saying "
+                "which come first: leave it out, or record the drive with more"
+            )
+    return replace(drives, drives=seen)
 
 
 def campaign_logs(campaign: Campaign, campaigns: Path) -> list[Path]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, TypeAlias
 
 from engram.cli.settings import AllSettings
 from engram.config import config_hash, to_dict
 from engram.errors import ConfigError
-from engram.frontend.frontend import Frontend
+from engram.frontend.frontend import Frontend, FrontendConfig
 from engram.localiser.attempts import Matcher
 from engram.localiser.localiser import InForce, Localiser
 from engram.localiser.settings import METHOD_VERSION
@@ -32,6 +32,7 @@ _NAMES = {
     "localiser.success": "success",
     "localiser.acceptance.rule": "rule",
     "frontend.descriptor": "features",
+    "frontend.landmarks": "landmarks",
     "method": "method",
     "world": "world",
 }
@@ -70,6 +71,7 @@ def of_localiser(
     return {
         **found,
         "frontend.descriptor": str(drive.descriptor),
+        "frontend.landmarks": drive.landmarks or FrontendConfig().landmarks,
         "front-end": drive.frontend,
         "odometry": drive.odometry,
         "method": METHOD_VERSION,
@@ -177,6 +179,10 @@ def check_logs(settings: Settings, drives: DriveSet) -> None:
             f"out, or extract the drives with {asked}"
         )
     fitted, usual = (one.for_descriptor(kind) for one in (settings, Settings()))
+    if drives.drives[0].landmarks == fitted.frontend.landmarks:
+        # The logs were made with more of them, and are read so.
+        frontend = replace(fitted.frontend, landmarks=usual.frontend.landmarks)
+        fitted = replace(fitted, frontend=frontend)
     hashes = {
         "frontend": Frontend(fitted.frontend).hash,
         "odometry": config_hash(fitted.odometry),
