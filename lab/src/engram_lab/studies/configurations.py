@@ -131,7 +131,7 @@ def sweep(
     rounds: Sequence[int] = (1, 2),
     config: LocaliserConfig | None = None,
 ) -> tuple[Configuration, ...]:
-    """All that is run in the whole map: policy × Np, T, Nr = 2, and the variants of `path-near`.
+    """All that is run in the whole map: policy × Np, T, Nr = 2, and the path policies' variants.
 
     Args:
         config: the settings, from which the variants differ; None for the defaults.
@@ -152,11 +152,11 @@ def sweep(
         limited = [np for np in lanes if np != UNLIMITED]
         add(Configuration(one, np, nr) for one in policies if one in TWO_ROUNDS for np in limited)
     if "path-near" in policies:
-        swept = (None if T == config.recent.T else T for T in T_SWEEP)
-        add(Configuration("path-near", few, rounds[0], T) for T in swept)
         add(Configuration("path-near", np, rounds[0], paths=other) for np in lanes)
     for policy in PATH_POLICIES:
         if policy in policies:
+            swept = (None if T == config.recent.T else T for T in T_SWEEP)
+            add(Configuration(policy, few, rounds[0], T) for T in swept)
             add([Configuration(policy, few, rounds[0], radius=Radius.BASIN)])
             add([Configuration(policy, few, rounds[0], paths=other)])
     return tuple(found)
@@ -165,10 +165,12 @@ def sweep(
 def map_sizes(
     policies: Sequence[str], lanes: int, sessions: int, rounds: int = 1
 ) -> tuple[Configuration, ...]:
-    """[L15] Fig. 9: each policy in the map as it was after each training session but the last."""
+    """[L15] Fig. 9: each policy in the map after 1, 2, 4 training sessions and every eighth."""
+    counts = (1, 2, 4, *range(8, sessions, 8))
     return tuple(
         Configuration(policy, lanes, rounds, sessions=count)
-        for count in range(1, sessions)
+        for count in counts
+        if count < sessions
         for policy in policies
     )
 

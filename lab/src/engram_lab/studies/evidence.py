@@ -48,8 +48,8 @@ class Study:
 
     Attributes:
         commands: command lines in their order. `{out}` stands for the study's folder, `{campaigns}`
-            for that of rendered drives, `{data}` for the real images; a `*` for what is there. What
-            the nth command prints is kept as `n.txt`.
+            for that of rendered drives, `{data}` for the real images, `{settings}` for the studies'
+            settings files; a `*` for what is there. What the nth command prints is kept as `n.txt`.
         minutes: on two cores, rendering included; an estimate.
         tables: names in its folder of what the repository keeps (`engram_lab.studies.pages`).
         pages: documents and reports that state its figures.
@@ -72,6 +72,9 @@ class Study:
 _CHECKS = "python -m engram_lab.checks."
 _EVALUATE = "engram lab evaluate "
 _POLICIES = "distance,path,path-near,recall,oracle"
+_SWEPT = "--lanes 1,2,4,8,16,0 --rounds 1 --live-folds 0"
+_STUDIED = ("summary.csv", "sessions.csv", "in_force.csv", "configuration.json")
+_FIRST_40 = ",".join(map(str, range(40)))
 # Of the town in which false joins are planted.
 _LAPS = ("3", "13", "23", "33")
 _TOWN_2 = f"{{campaigns}}/begbroke24h-standard-seed2-v{WORLD_VERSION}"
@@ -107,26 +110,51 @@ STUDIES: Mapping[str, Study] = {
         ("1.txt",),
         ("docs/evidence.md", "lab/reports/conditions.md"),
     ),
+    # Fifteen days and nights; the papers' own sizes are in "ranking-elsewhere".
     "ranking": Study(
+        (
+            f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
+            f"{_EVALUATE}ranking begbroke24h --first 40 --policies {_POLICIES} {_SWEPT} "
+            "--only-folds 0,1 --out {out}",
+        ),
+        70,
+        _STUDIED,
+        ("docs/papers.md", "lab/reports/ranking.md"),
+        campaigns=("begbroke24h",),
+        resumes=True,
+    ),
+    "starved": Study(
+        (
+            f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
+            f"{_EVALUATE}ranking begbroke24h --first 40 --policies {_POLICIES} {_SWEPT} "
+            "--only-folds 0,1 --config {settings}/starved.toml --out {out}",
+        ),
+        70,
+        (*_STUDIED, "maps.csv"),
+        ("lab/reports/ranking.md",),
+        campaigns=("begbroke24h",),
+        resumes=True,
+    ),
+    "ranking-elsewhere": Study(
         (
             "engram lab simulate begbroke24h",
             "engram lab simulate keble",
             "engram lab simulate oxford",
-            f"{_EVALUATE}ranking begbroke keble oxford --policies {_POLICIES} "
-            "--lanes 1,2,4,8,16,0 --rounds 1 --live-folds 0 --out {out}",
+            f"{_EVALUATE}ranking begbroke keble oxford --policies {_POLICIES} {_SWEPT} "
+            "--out {out}",
         ),
-        200,
-        ("summary.csv", "sessions.csv", "in_force.csv", "configuration.json"),
-        ("docs/papers.md", "lab/reports/ranking.md"),
+        300,
+        _STUDIED,
+        ("lab/reports/ranking.md",),
         campaigns=("begbroke24h", "keble", "oxford"),
         resumes=True,
     ),
     "budgets": Study(
         (
-            "engram lab simulate begbroke24h",
-            f"{_EVALUATE}budgets begbroke24h --only-folds 0 --out {{out}}",
+            f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
+            f"{_EVALUATE}budgets begbroke24h --first 25 --only-folds 0 --out {{out}}",
         ),
-        90,
+        60,
         ("sessions.csv", "cells.csv", "times.csv", "configuration.json"),
         ("docs/ranking.md",),
         campaigns=("begbroke24h",),
@@ -134,26 +162,38 @@ STUDIES: Mapping[str, Study] = {
     ),
     "fleet": Study(
         (
-            "engram lab simulate begbroke24h",
-            f"{_EVALUATE}fleet begbroke24h --tried 5 --groups 4 --arms A,B --experiments 7,8,9 "
-            "--only-folds 0,1,2 --out {out}",
-            f"{_EVALUATE}fleet begbroke24h --tried 5 --arms B --experiments 10 --only-folds 0 "
-            "--out {out}/orders",
+            f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
+            f"{_EVALUATE}fleet begbroke24h --first 40 --tried 5 --groups 4 --arms A,B "
+            "--experiments 7,9 --only-folds 0,1 --out {out}",
         ),
-        90,
-        ("summary.csv", "sessions.csv", "in_force.csv", "configuration.json"),
+        70,
+        _STUDIED,
         ("docs/papers.md", "lab/reports/fleet.md", "lab/reports/downloads.md"),
         campaigns=("begbroke24h",),
         resumes=True,
     ),
     "fleet-as-published": Study(
         (
-            "engram lab simulate begbroke24h",
-            f"{_EVALUATE}fleet begbroke24h --config gadd2016 --arms P --tried 5 --groups 4 "
-            "--experiments 7,9 --only-folds 0,1 --out {out}",
+            f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
+            f"{_EVALUATE}fleet begbroke24h --first 40 --config {{settings}}/starved-fleet.toml "
+            "--tried 5 --groups 4 --experiments 7,9 --only-folds 0 --out {out}",
         ),
         45,
-        ("summary.csv", "sessions.csv", "in_force.csv", "configuration.json"),
+        _STUDIED,
+        ("lab/reports/fleet.md",),
+        campaigns=("begbroke24h",),
+        resumes=True,
+    ),
+    "fleet-whole": Study(
+        (
+            "engram lab simulate begbroke24h",
+            f"{_EVALUATE}fleet begbroke24h --tried 5 --groups 4,2,8 --arms A,B "
+            "--experiments 7,8,9 --out {out}",
+            f"{_EVALUATE}fleet begbroke24h --tried 5 --arms B --experiments 10 "
+            "--out {out}/orders",
+        ),
+        300,
+        _STUDIED,
         ("lab/reports/fleet.md",),
         campaigns=("begbroke24h",),
         resumes=True,
@@ -321,6 +361,8 @@ class Manifest:
 
 
 MANIFEST = "manifest.json"
+# Settings files of studies.
+SETTINGS = Path(__file__).with_name("settings")
 
 
 def read_manifest(folder: Path) -> Manifest | None:
@@ -538,7 +580,7 @@ def words_of(line: str, folder: Path) -> list[str]:
     data = os.environ.get("ENGRAM_DATA", "")
     words: list[str] = []
     for word in shlex.split(line):
-        filled = word.format(out=folder, campaigns=campaigns_folder(), data=data)
+        filled = word.format(out=folder, campaigns=campaigns_folder(), data=data, settings=SETTINGS)
         path = Path(filled)
         words += map(str, sorted(path.parent.glob(path.name))) if "*" in word else [filled]
     return words

@@ -32,6 +32,7 @@ from engram_lab.policies import STUDIED
 from engram_lab.studies.building import BuiltMap
 from engram_lab.studies.configurations import (
     EVERYTHING,
+    PATH_POLICIES,
     UNLIMITED,
     Configuration,
     PathKinds,
@@ -539,7 +540,7 @@ def few_lanes_results(campaign: CampaignResult) -> list[ConfigurationResult]:
     found = [campaign.get(policy) for policy in campaign.policies]
     found += [
         campaign.get(policy, **variant)
-        for policy in ("path-near", "path")
+        for policy in PATH_POLICIES
         for variant in ({"radius": Radius.BASIN}, {"paths": campaign.paths.other})
     ]
     return [one for one in found if one is not None]
@@ -647,7 +648,7 @@ def draw_figures(out: Path, campaigns: Sequence[CampaignResult], rows: Sequence[
         formula = FORMULAS[estimator] + (" · share of route not localised" if scaled else "")
         draw(name, panels, f"failure curves, {rounds}; P(X ≥ x) = {formula}")
     swept = [_sensitivity(one, own[one.name]) for one in campaigns]
-    draw("fig13_T.png", swept, f"sensitivity of path-near to T, {few}")
+    draw("fig13_T.png", swept, f"sensitivity of the path policies to T, {few}")
     for one in campaigns:
         written += _draw_costs(out, one, own[one.name])
     return written
@@ -727,15 +728,20 @@ def _curves(campaign: CampaignResult, twice: int, estimator: Estimator, scaled: 
 def _sensitivity(campaign: CampaignResult, own: Sequence[Row]) -> Panel:
     """[L15] Fig. 13: T."""
     lanes = lanes_text(campaign.few_lanes)
-    some = chosen(own, label="path-near", lanes=lanes, rounds=campaign.rounds, map_sessions=None)
-    some.sort(key=lambda row: row["T"])
-    places = list(range(len(some)))
-    ticks = [(float(x), str(row["T"])) for x, row in zip(places, some, strict=True)]
     columns = {"P(> 10 m)": "p_gt_10m", "route not localised": "share_not_localised"}
-    if len(some) < 2:  # path-near was not run, or with one T
-        return Panel(campaign.name, "T", "%", [], ticks)
-    lines = [row_line(label, some, places, column) for label, column in columns.items()]
-    return Panel(campaign.name, "T", "%", lines, ticks)
+    lines, ticks = [], dict[float, str]()
+    for policy in PATH_POLICIES:
+        some = chosen(own, label=policy, lanes=lanes, rounds=campaign.rounds, map_sessions=None)
+        some.sort(key=lambda row: row["T"])
+        if len(some) < 2:  # it was not run, or with one T
+            continue
+        places = list(range(len(some)))
+        ticks |= {float(x): str(row["T"]) for x, row in zip(places, some, strict=True)}
+        lines += [
+            row_line(f"{policy}, {label}", some, places, column)
+            for label, column in columns.items()
+        ]
+    return Panel(campaign.name, "T", "%", lines, list(ticks.items()))
 
 
 def _draw_costs(out: Path, campaign: CampaignResult, own: Sequence[Row]) -> list[Path]:
@@ -809,6 +815,9 @@ def write_report(out: Path, plans: Sequence[Plan]) -> Report:
         "summary": rows,
         "sessions": [row for one in campaigns for row in session_rows(one)],
         "comparisons": comparisons,
+        "maps": [
+            row for one, plan in zip(campaigns, plans, strict=True) for row in _map_rows(one, plan)
+        ],
     }
     files = write_study(
         out,
@@ -855,10 +864,10 @@ def _comparisons(campaign: CampaignResult) -> Iterator[Row]:
         if a is not None and b is not None and a is not b:
             yield compared(what, a.not_localised, b.not_localised, resamples, paper)
 
-    nearest, bound, near = (campaign.get(name) for name in ("distance", "oracle", "path-near"))
+    nearest, bound = (campaign.get(name) for name in ("distance", "oracle"))
     if nearest is not None and bound is not None:
         for result in few_lanes_results(campaign):
-            if result.configuration.policy in {"path", "path-near"}:
+            if result.configuration.policy in PATH_POLICIES:
                 label = result.configuration.label
                 sums = nearest.not_localised, result.not_localised
                 excess = excess_ratio(*sums, bound.not_localised)
@@ -868,7 +877,7 @@ def _comparisons(campaign: CampaignResult) -> Iterator[Row]:
                 yield rated(f"{what}: route not localised", ratio(*sums), resamples)
                 far = ratio(nearest.failure(10.0), result.failure(10.0))
                 yield rated(f"{what}: P(> 10 m)", far, resamples)
-    for policy in ("path", "path-near"):
+    for policy in PATH_POLICIES:
         name = f"`{policy}`"
         yield from pair(
             f"{name} at Np = 2 against `distance` at Np = 4",
@@ -878,10 +887,11 @@ def _comparisons(campaign: CampaignResult) -> Iterator[Row]:
             f"{name} against `distance`, Np unlimited",
             campaign.get(policy, UNLIMITED), campaign.get("distance", UNLIMITED), "equal",
         )  # fmt: skip
-    yield from pair(
-        f"`path-near` with T = 0 against T = {campaign.T}",
-        campaign.get("path-near", T=0), near, "worse",
-    )  # fmt: skip
+    for policy in PATH_POLICIES:
+        yield from pair(
+            f"`{policy}` with T = 0 against T = {campaign.T}",
+            campaign.get(policy, T=0), campaign.get(policy), "worse",
+        )  # fmt: skip
     ours = campaign.get(_BEST_KNOWN)
     for other in ("path", "path-near", "distance", "bandit"):
         yield from pair(f"`{_BEST_KNOWN}` against `{other}`", ours, campaign.get(other))
@@ -889,7 +899,7 @@ def _comparisons(campaign: CampaignResult) -> Iterator[Row]:
         to_bound = ratio(ours.not_localised, bound.not_localised, _NEGLIGIBLE)
         what = f"`{_BEST_KNOWN}` ÷ `oracle`: route not localised, 0.5 % added to both"
         yield rated(what, to_bound, resamples)
-    for policy, paper in (("distance", "rises"), ("path-near", "falls 4×"), (_BEST_KNOWN, "")):
+    for policy, paper in (("distance", "rises"), ("path", "falls 4×"), (_BEST_KNOWN, "")):
         whole, first = campaign.get(policy), campaign.get(policy, sessions=1)
         if whole is not None and first is not None:
             fall = ratio(first.failure(10.0), whole.failure(10.0))
@@ -933,6 +943,31 @@ def pooled_rows(campaigns: Sequence[CampaignResult]) -> list[Row]:
             row = compared(f"`{_BEST_KNOWN}` against `{other}`", a, b, resamples)
             rows.append({"campaign": "pooled", **row})
     return rows
+
+
+def _map_rows(campaign: CampaignResult, plan: Plan) -> Iterator[Row]:
+    """What building each fold's map came to: nodes by what the drives that were mapped missed."""
+    some = next(iter(campaign.memo.values()), None)
+    if some is None:
+        return
+    m_per_frame = float(some.driven_m.sum()) / some.frames
+    for fold in plan.run_folds:
+        mapped = built_map(plan, fold).sessions
+        frames = sum(one.frames for one in mapped)
+        if not frames:
+            continue
+        missed = 1 - sum(one.share_localised * one.frames for one in mapped) / frames
+        per_m = mapped[-1].nodes / (frames * m_per_frame)
+        yield {
+            "campaign": campaign.name,
+            "fold": fold.number,
+            "drives": len(mapped),
+            "driven_m": frames * m_per_frame,
+            "share_not_localised": missed,
+            "nodes": mapped[-1].nodes,
+            "nodes_per_m": per_m,
+            "nodes_per_m_not_localised": per_m / missed if missed else None,
+        }
 
 
 def _together(sums: Sequence[SessionSums]) -> SessionSums:
