@@ -79,7 +79,8 @@ def simulate(
         str,
         typer.Argument(
             metavar="CAMPAIGN",
-            help="hamlet, village, begbroke, keble, oxford, begbroke24h or estate.",
+            help="hamlet, village, begbroke, keble, oxford, begbroke24h, year, wet, covered or "
+            "estate.",
         ),
     ],
     *,

@@ -327,6 +327,32 @@ def _oxford(seed: int, size: Size) -> Campaign:
     return Campaign("oxford", seed, length, False, sessions, 0.9, size, "oxford", 0.65)
 
 
+# Hours (UTC) of the weekly drives of a year, one after another: no season meets one hour alone.
+_WEEKLY_HOURS = (9.0, 16.5, 12.0, 21.5, 7.5, 18.0, 14.0, 1.5)
+# Share of winter weeks whose drive finds snow: eight days of Oxford's winter.
+_SNOWY = 8 / 90
+
+
+def _year(seed: int, size: Size) -> Campaign:
+    """A drive a week for a year round a small town, at all hours; it rains as in Oxford."""
+    rng = np.random.default_rng([seed, 0x3E5])
+    first = datetime(2025, 3, 3, tzinfo=UTC)
+    starts = [
+        first + timedelta(days=7 * k, hours=_WEEKLY_HOURS[k % len(_WEEKLY_HOURS)])
+        for k in range(52)
+    ]
+    weathers = _dealt(rng, 52)
+    plans = _planned("year", seed, starts, weathers, ["wildcat"] * 52, [False] * 52)
+    plans = _under(Rainfall(seed), plans)
+    winter = [plan.number for plan in plans if plan.start.month in {12, 1, 2}]
+    snowy = set(rng.choice(winter, max(1, round(_SNOWY * len(winter))), replace=False).tolist())
+    sessions = tuple(
+        replace(plan, weather="snow", rain_mm_h=None) if plan.number in snowy else plan
+        for plan in plans
+    )
+    return Campaign("year", seed, 200, False, sessions, 0.4, size, "year")
+
+
 def _wet(seed: int, size: Size) -> Campaign:
     """A stress, never averaged with months: three of four drives in rain of 1 mm/h on.
 
@@ -394,6 +420,7 @@ CAMPAIGNS: dict[str, Callable[[int, Size], Campaign]] = {
     "oxford": _oxford,
     "begbroke24h": _begbroke24h,
     "estate": estate,
+    "year": _year,
     "wet": _wet,
     "covered": _covered,
 }

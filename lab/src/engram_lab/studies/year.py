@@ -1,0 +1,219 @@
+"""A year in one map: does it tend to a constant, and what does deleting cost?
+
+    engram lab simulate year
+    python -m engram_lab.studies.year --out results/year
+
+The weekly drives of campaign `year` are mapped one after another, as a robot does it by default.
+[L15] §II says of its predecessor that the number of experiences tends to a constant, and against
+deleting that what is deleted may be needed again. So the same drives are mapped in maps that may
+hold a share of the nodes that the whole map comes to, and that forget after each drive what is
+beyond: what serves least (`engram forget --down-to`), the drives' oldest nodes, or any. A second
+run continues where the first one stopped.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from engram.fleet.download.part import Stock
+from engram.fleet.forgetting import bridges_over, serving_order
+from engram.graph.model import NodeId
+from engram.maps.forgetting import Chosen
+from engram.maps.map import Map
+from engram.measures import Drive, failure_sums, route_not_localised
+from engram.monitor import write_whole
+from engram.robot.mapping import MapReport
+from engram.robot.settings import RobotOptions, Settings
+from engram.robot.starting import measured
+from engram_lab.programs import command_line
+from engram_lab.studies.building import build_map, write_json
+from engram_lab.studies.drives import EvaluatedDrive, open_campaign
+from engram_lab.studies.plan import Row, table
+from engram_lab.town.simulating import campaigns_folder
+
+# Share of the whole map's last number of nodes that a map which forgets may hold.
+SHARE = 0.5
+_FAR_M = 10.0
+# From this drive on growth is judged: three months.
+_SETTLED = 13
+
+
+def random_order(stock: Stock) -> list[NodeId]:
+    """Nodes in an order that says nothing, the same in every run."""
+    return [stock.node_ids[at] for at in np.random.default_rng(0).permutation(len(stock))]
+
+
+def newest_first(stock: Stock) -> list[NodeId]:
+    """The oldest nodes last."""
+    at = sorted(range(len(stock)), key=lambda k: stock.nodes[k].stamp_ns, reverse=True)
+    return [stock.node_ids[k] for k in at]
+
+
+def most_serving_first(stock: Stock) -> list[NodeId]:
+    """As `engram forget --down-to` keeps them."""
+    return [stock.node_ids[at] for at in serving_order(stock).tolist()]
+
+
+# In what order a map's nodes are kept; none forgets nothing.
+ARMS: Mapping[str, Callable[[Stock], list[NodeId]] | None] = {
+    "everything kept": None,
+    "least serving forgotten": most_serving_first,
+    "oldest forgotten": newest_first,
+    "random forgotten": random_order,
+}
+
+
+def forget_down_to(path: Path, most: int, kept_first: Callable[[Stock], list[NodeId]]) -> int:
+    """Forgets nodes of a map until so many are left; how many that were."""
+    with Map.open(path, writes=True) as store:
+        nodes = kept_first(Stock(store))
+        if len(nodes) <= most:
+            return 0
+        chosen = Chosen(nodes=frozenset(nodes[most:]))
+        store.forget_nodes(
+            chosen,
+            bridges_over(store, chosen),
+            author="laboratory",
+            message="forget: a year",
+            configuration={},
+            dry_run=False,
+        )
+    return len(nodes) - most
+
+
+@dataclass(frozen=True, slots=True)
+class Year:
+    """The drives of a year, and where their maps are kept."""
+
+    drives: Sequence[EvaluatedDrive]
+    folder: Path
+    settings: Settings
+    options: RobotOptions
+
+    def rows(self, arm: str, most: int | None) -> list[Row]:
+        """One row for each drive, in a map of all before it.
+
+        Args:
+            arm: key of `ARMS`.
+            most: nodes that the map may hold after a drive; None for any number.
+        """
+        path = self.folder / f"{arm.replace(' ', '-')}.engram"
+        kept = path.with_suffix(".rows.json")
+        found: list[Row] = json.loads(kept.read_text()) if kept.exists() else []
+        for number in range(len(found), len(self.drives)):
+            built = build_map(
+                path,
+                self.drives[: number + 1],
+                self.settings,
+                self.options,
+                look_at=lambda drive, report: found.append(_row(arm, drive, report)),
+            )
+            if len(found) <= number:
+                raise SystemExit(f"{path} holds drives that {kept} lacks; remove both")
+            kept_first = ARMS[arm]
+            if most is not None and kept_first is not None:
+                found[number]["forgotten"] = forget_down_to(path, most, kept_first)
+            with Map.open(path) as store:
+                one = built.sessions[number]
+                found[number] |= {
+                    "nodes": store.node_count(),
+                    "size_bytes": store.info().size_bytes,
+                    "attempts_per_frame": one.attempts / max(one.frames, 1),
+                }
+            write_json(kept, found)
+        return found
+
+
+def _row(arm: str, drive: EvaluatedDrive, report: MapReport) -> Row:
+    seen = measured(report.results)
+    far_m, driven_m = failure_sums(seen, np.array([_FAR_M]))
+    return {
+        "arm": arm,
+        "drive": drive.name,
+        "driven_m": float(driven_m),
+        "far_m": float(far_m[0]),
+        "share_not_localised": _missed(seen),
+        "saved": report.saved,
+        "forgotten": 0,
+    }
+
+
+def _missed(drive: Drive) -> float:
+    return float(route_not_localised([drive]))
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    with write_whole(path) as draft, draft.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def quarters(rows: Sequence[Row]) -> Iterator[Row]:
+    """What each arm came to, by quarters of the year."""
+    for arm in dict.fromkeys(row["arm"] for row in rows):
+        own = [row for row in rows if row["arm"] == arm]
+        for quarter in range(4):
+            some = own[_SETTLED * quarter : _SETTLED * (quarter + 1)]
+            if not some:
+                continue
+            driven_m = sum(row["driven_m"] for row in some)
+            yield {
+                "arm": arm,
+                "weeks": f"{_SETTLED * quarter + 1} to {_SETTLED * quarter + len(some)}",
+                "nodes saved a km": sum(row["saved"] for row in some) / driven_m * 1e3,
+                "nodes": some[-1]["nodes"],
+                # What is forgotten stays in the file until it is erased.
+                "MB": None if some[-1]["forgotten"] else some[-1]["size_bytes"] / 1e6,
+                "route not localised, %": 100
+                * sum(row["share_not_localised"] * row["driven_m"] for row in some)
+                / driven_m,
+                "P(> 10 m), %": 100 * sum(row["far_m"] for row in some) / driven_m,
+                "attempts a frame": float(np.mean([row["attempts_per_frame"] for row in some])),
+            }
+
+
+def growth_a_month(rows: Sequence[Row]) -> float:
+    """Growth of the nodes after the third month, per cent of them a month of 52 ÷ 12 weeks."""
+    after = np.array([row["nodes"] for row in rows[_SETTLED - 1 :]], np.float64)
+    months = (len(after) - 1) * 12 / 52
+    return float(100 * ((after[-1] / after[0]) ** (1 / months) - 1)) if months > 0 else 0.0
+
+
+def main() -> None:
+    """Maps the year in every arm, and reports it."""
+    parser = command_line(__doc__)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--campaign", default="year", help="NAME or NAME@SEED")
+    parser.add_argument("--arms", default=",".join(ARMS), help="some of them, by name")
+    asked = parser.parse_args()
+    settings = Settings().for_descriptor(None)
+    drives = open_campaign(asked.campaign, campaigns_folder(), settings=settings).drives
+    asked.out.mkdir(parents=True, exist_ok=True)
+    year = Year(drives, asked.out, settings, RobotOptions())
+    first, *others = ARMS
+    found = year.rows(first, None)
+    most = int(SHARE * found[-1]["nodes"])
+    for arm in others:
+        if arm in asked.arms.split(","):
+            found += year.rows(arm, most)
+    _write_csv(asked.out / "drives.csv", found)
+    whole = [row for row in found if row["arm"] == first]
+    lines = [
+        f"{len(whole)} drives of `{asked.campaign}`. Nodes grow by {growth_a_month(whole):.1f} % a "
+        f"month after the third month. Maps that forget hold {most} nodes at most.",
+        "",
+        *table(list(quarters(found))),
+    ]
+    (asked.out / "year.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
