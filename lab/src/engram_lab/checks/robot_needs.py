@@ -25,32 +25,36 @@ from pathlib import Path
 import numpy as np
 
 from engram import _core
-from engram.frontend.frame import StereoPair
+from engram.cli.settings import read_settings
+from engram.frontend.frame import BRIEF, StereoPair
 from engram.maps.map import open_map
-from engram.robot.settings import Settings
 from engram_lab.bench.data import load_bench_data
 from engram_lab.programs import Figure, command_line, report
 
 SIZES = ("512", "full")
+# What ships, the default first.
+KINDS = (BRIEF, "net")
 _INSTRUCTION_SETS = ("generic", "v3", "v4")
 _PERIOD_NS = 100_000_000
 _MAPPED = 3  # every so many frames are the map
 _ROBOTS = 6
 
 
-def measured(pairs: Sequence[StereoPair], *, doctor: bool = False) -> Iterator[Figure]:
+def measured(
+    pairs: Sequence[StereoPair], *, doctor: bool = False, features: str = BRIEF
+) -> Iterator[Figure]:
     """Localised share, processor time a step in ms, and the process's largest memory in MB."""
+    settings = read_settings(None, [f"frontend.descriptor={features}"]).of_robot()
     with tempfile.TemporaryDirectory(prefix="engram-needs-") as folder:
         path = Path(folder) / "street.engram"
         with (
             open_map(path, create=True) as opened,
-            opened.robot(pairs[0].camera, name="needs", maps=True) as mapper,
+            opened.robot(pairs[0].camera, settings, name="needs", maps=True) as mapper,
         ):
             for number in range(0, len(pairs), _MAPPED):
                 mapper.step(_at(number, pairs[number]))
         taken = []
         localised = 0
-        settings = Settings()
         if not doctor:
             settings = replace(settings, doctor=replace(settings.doctor, frames=0))
         with open_map(path) as opened:
@@ -78,23 +82,29 @@ def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--one", choices=SIZES, help="measure this size in this process alone")
     parser.add_argument("--doctor", action="store_true", help="with --one: leave the doctor on")
+    parser.add_argument("--features", default=BRIEF, choices=KINDS, help="with --one: the kind")
     asked = parser.parse_args()
     if asked.one:
         pairs = load_bench_data().at(asked.one)
-        report(measured(pairs, doctor=asked.doctor), asked.json, title=asked.one)
+        figures = measured(pairs, doctor=asked.doctor, features=asked.features)
+        report(figures, asked.json, title=asked.one)
         return
     sets = _INSTRUCTION_SETS if _core.isa in _INSTRUCTION_SETS else (_core.isa,)
     for isa in sets[: sets.index(_core.isa) + 1]:
-        for size in SIZES:
-            title = f"{isa}, {size}"
-            report(_elsewhere(isa, size), asked.json, title)
+        for features in KINDS:
+            for size in SIZES:
+                title = f"{isa}, {size}" + (f", {features}" if features != BRIEF else "")
+                report(_elsewhere(isa, size, features), asked.json, title)
 
 
-def _elsewhere(isa: str, size: str) -> list[Figure]:
+def _elsewhere(isa: str, size: str, features: str) -> list[Figure]:
     with tempfile.TemporaryDirectory(prefix="engram-needs-") as folder:
         file = Path(folder) / "figures.json"
         subprocess.run(
-            [sys.executable, "-m", __spec__.name, "--one", size, "--json", str(file)],
+            [
+                *(sys.executable, "-m", __spec__.name, "--one", size),
+                *("--features", features, "--json", str(file)),
+            ],
             env={**os.environ, "ENGRAM_ISA": isa},
             stdout=subprocess.DEVNULL,
             check=True,

@@ -1,6 +1,7 @@
 """What a robot localises by condition, in a map of one clear morning and one fair night.
 
     python -m engram_lab.studies.conditions --maps maps --towns 22 --landmarks 600,1000
+    python -m engram_lab.studies.conditions --maps maps --towns 507,508 --csv conditions.csv
     python -m engram_lab.studies.conditions --maps maps --set mapper.landmarks=0 --misplaced 15
 
 Small towns of one loop, eleven drives each in all kinds of light and weather. Each drive that is
@@ -14,12 +15,14 @@ localising alone.
 
 from __future__ import annotations
 
+import csv
 import time
 from argparse import Namespace
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +31,7 @@ from engram.config import config_hash
 from engram.frontend.frontend import FrontendConfig
 from engram.geometry.se3 import SE3
 from engram.maps.map import open_map
+from engram.monitor import write_whole
 from engram.robot.settings import RobotOptions, Settings
 from engram_lab.accuracy import Count
 from engram_lab.programs import command_line, numbers
@@ -234,9 +238,19 @@ def print_all(towns: Conditions, seed: int, asked: Namespace) -> None:
     """Prints what is asked of one town."""
     if not asked.no_rows:
         print(HEADER)
+        rows = []
         for row in towns.rows(seed):
             print(row.text(), flush=True)
-        print(f"nodes and bytes: {towns.size(seed)}", flush=True)
+            rows.append(row)
+        nodes, size = towns.size(seed)
+        print(f"nodes and bytes: {nodes, size}", flush=True)
+        if asked.csv is not None:
+            about = {
+                "town": str(seed),
+                "kind": asked.kind,
+                "mapped": " ".join(map(str, asked.mapped)),
+            }
+            add_rows(asked.csv, about, rows, {"nodes": nodes, "size_bytes": size})
     if asked.misplaced:
         other = next((one for one in asked.towns if one != seed), seed + 1)
         for kind, count in towns.misplaced(seed, other, asked.misplaced).items():
@@ -248,6 +262,21 @@ def print_all(towns: Conditions, seed: int, asked: Namespace) -> None:
     if asked.month:
         nodes, size, each = towns.month(seed)
         print(f"month: {nodes} nodes, {size / 1e6:.1f} MB, by drive {each}", flush=True)
+
+
+def add_rows(
+    path: Path, about: Mapping[str, str], rows: Sequence[Row], size: Mapping[str, int]
+) -> None:
+    """Adds the rows of one map to a table, in place of those that it has of it."""
+    kept: list[dict[str, Any]] = []
+    if path.exists():
+        with path.open(encoding="utf-8", newline="") as file:
+            kept = [one for one in csv.DictReader(file) if not about.items() <= one.items()]
+    table = [*kept, *({**about, **asdict(row), **size} for row in rows)]
+    with write_whole(path) as draft, draft.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(table[0]))
+        writer.writeheader()
+        writer.writerows(table)
 
 
 def main() -> None:
@@ -262,6 +291,7 @@ def main() -> None:
     parser.add_argument("--misplaced", type=int, default=0, metavar="N", help="of each kind")
     parser.add_argument("--month", action="store_true")
     parser.add_argument("--no-rows", action="store_true")
+    parser.add_argument("--csv", type=Path, metavar="FILE", help="adds the rows to this table")
     asked = parser.parse_args()
     for seed in asked.towns:
         for landmarks in asked.landmarks:

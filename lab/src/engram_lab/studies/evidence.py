@@ -104,10 +104,16 @@ STUDIES: Mapping[str, Study] = {
         ("docs/evidence.md", "lab/reports/performance.md"),
         town=False,
     ),
+    # Towns that no setting and no constant was chosen on.
     "conditions": Study(
-        ("python -m engram_lab.studies.conditions --maps {out}/maps --towns 504,505,506",),
-        25,
-        ("1.txt",),
+        tuple(
+            "python -m engram_lab.studies.conditions --maps {out}/maps --towns 507,508 "
+            f"--kind {kind} --mapped {mapped} --csv {{out}}/conditions.csv"
+            for kind in ("brief", "net")
+            for mapped in ("0,2", "0", "2")
+        ),
+        60,
+        ("conditions.csv",),
         ("docs/evidence.md", "lab/reports/conditions.md"),
     ),
     # Fifteen days and nights; the papers' own sizes are in "ranking-elsewhere".
