@@ -133,7 +133,7 @@ STUDIES: Mapping[str, Study] = {
         (
             f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
             f"{_EVALUATE}ranking begbroke24h --first 40 --policies {_POLICIES} {_SWEPT} "
-            "--only-folds 0,1 --config {settings}/starved.toml --out {out}",
+            "--only-folds 0 --config {settings}/starved.toml --out {out}",
         ),
         70,
         (*_STUDIED, "maps.csv"),
