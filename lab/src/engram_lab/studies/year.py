@@ -115,7 +115,7 @@ class Year:
                 look_at=lambda drive, report: found.append(_row(arm, drive, report)),
             )
             if len(found) <= number:
-                raise SystemExit(f"{path} holds drives that {kept} lacks; remove both")
+                raise SystemExit(f"{path} holds drives that are missing from {kept}; remove both")
             kept_first = ARMS[arm]
             if most is not None and kept_first is not None:
                 found[number]["forgotten"] = forget_down_to(path, most, kept_first)
