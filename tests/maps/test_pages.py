@@ -401,6 +401,18 @@ def test_places_in_columns_are_those_of_the_records(opened: Map) -> None:
         assert (record.session, record.stamp_ns) == (placed.sessions[number].id, stamp_ns)
 
 
+def test_parts_and_chains_in_columns_are_those_of_the_graph(opened: Map) -> None:
+    placed, graph = opened.placed(), opened.graph
+    at = [graph.index(NodeId(UUID(bytes=uuid.tobytes()))) for uuid in placed.uuids]
+    assert len(np.unique(placed.experience)) > 1
+    for found, expected in (
+        (placed.component, graph.components()[at]),
+        (placed.experience, graph.experiences[at]),
+    ):
+        pairs = set(zip(found.tolist(), expected.tolist(), strict=True))
+        assert len(pairs) == len(set(found.tolist())) == len(set(expected.tolist()))
+
+
 def test_a_goal_is_stored_in_the_nearest_node_that_looks_its_way(opened: Map) -> None:
     layout, rng = opened.layout(), np.random.default_rng(4)
     ahead = layout.poses.rotations[:, :2, 2]

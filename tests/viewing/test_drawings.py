@@ -34,7 +34,7 @@ def test_a_map_is_lines_that_start_somewhere(two_parts: Path) -> None:
     with engram.open_map(two_parts) as opened:
         parts = parts_of(opened)
         nodes = opened.node_count()
-    assert parts.nodes == nodes == len(parts.part)
+    assert parts.nodes == nodes
     first = parts.panels[0].tracks[0]
     (line,) = first.lines()
     np.testing.assert_array_equal(line, first.points_m)
@@ -50,7 +50,6 @@ def test_parts_that_nothing_joins_are_drawn_apart_and_say_so(two_parts: Path) ->
     assert titles[1].endswith("relation unknown")
     sizes = [sum(len(track.points_m) for track in panel.tracks) for panel in parts.panels]
     assert sizes == sorted(sizes, reverse=True)
-    assert parts.undrawn == (0, 0)
     assert parts.text() == ""
 
 
@@ -58,7 +57,7 @@ def test_parts_beyond_the_sixth_are_counted(two_parts: Path, monkeypatch) -> Non
     monkeypatch.setattr("engram.viewing.drawings._PARTS", 1)
     with engram.open_map(two_parts) as opened:
         parts = parts_of(opened)
-    count = int((parts.part == 1).sum())
+    count = parts.above.sizes()[1]
     assert len(parts.panels) == 1
     assert parts.text() == f"1 smaller part ({count} nodes) not drawn"
 

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection
 
 from engram.errors import MapCorruptError
-from engram.graph.model import Session
-from engram.maps.reading import load_cameras, sessions_by_key
+from engram.graph.graph import labels_of
+from engram.graph.model import EdgeKind, Session
+from engram.maps.reading import edges_between, load_cameras, sessions_by_key
 from engram.maps.schema import nodes, placements
 from engram.maps.totals import read_in_stretches
 from engram.maps.view import View, places_in_history
@@ -28,6 +29,8 @@ class PlacedNodes:
         stamp_ns: (N,) int64.
         revision: (N,) int64, number of the revision that brought each; 0 of an open one.
         positions: (N, 3) float64, metres in the map frame.
+        component: (N,) int64, number of the connected component of each.
+        experience: (N,) int64, number of the chain of odometry edges of each.
     """
 
     sessions: Sequence[Session]
@@ -36,6 +39,8 @@ class PlacedNodes:
     stamp_ns: NDArray[np.int64]
     revision: NDArray[np.int64]
     positions: NDArray[np.float64]
+    component: NDArray[np.int64]
+    experience: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.session)
@@ -65,6 +70,7 @@ def load_placed(connection: Connection, view: View) -> PlacedNodes:
     to_place = np.array([in_order[key] for key in session_keys.tolist()], np.int64)
     brought, which = np.unique(revisions[chosen], return_inverse=True)
     number_of = np.array([numbers[key] for key in brought.tolist()], np.int64)
+    component, experience = _joined(connection, view, keys[order], owners[order])
     return PlacedNodes(
         tuple(known.values()),
         uuids[chosen],
@@ -72,7 +78,20 @@ def load_placed(connection: Connection, view: View) -> PlacedNodes:
         stamps[chosen],
         number_of[which],
         positions,
+        component[at],
+        experience[at],
     )
+
+
+def _joined(
+    connection: Connection, view: View, keys: NDArray[np.int64], owners: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The (N,) component and experience of nodes by their keys, ascending, and their sessions."""
+    found, ends = edges_between(connection, view, keys)
+    codes, kinds = found.texts["kind"]
+    odometry = np.array([kind == EdgeKind.ODOMETRY for kind in kinds], np.bool_)[codes]
+    chained = odometry & (owners[ends[:, 0]] == owners[ends[:, 1]])
+    return labels_of(ends, len(keys)), labels_of(ends[chained], len(keys))
 
 
 def _newest_places(

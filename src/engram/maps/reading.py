@@ -345,15 +345,30 @@ def _camera_id(known: dict[int, StereoCamera], row: Row, what: str) -> CameraId:
     return known[row["camera"]].id
 
 
-def _edges(
-    connection: Connection, view: View, node_keys: NDArray[np.int64], node_list: tuple[Node, ...]
-) -> EdgeTable:
-    """Edges between visible nodes: those of hidden nodes are hidden with them."""
+def edges_between(
+    connection: Connection, view: View, node_keys: NDArray[np.int64]
+) -> tuple[Columns, NDArray[np.int32]]:
+    """The E edges between visible nodes: those of hidden nodes are hidden with them.
+
+    Args:
+        connection: to the map.
+        view: of it.
+        node_keys: (N,) int64 keys of the visible nodes.
+
+    Returns:
+        Rows of `edges`, and the (E, 2) int32 places of their ends a and b in `node_keys`.
+    """
     found = read_columns(connection, view, edges).newest("a", "b", "kind")
     found = without_removed(removed_measurements(view.rows(connection, removals)), found)
     (a, a_seen), (b, b_seen) = (_dense(found[end], node_keys) for end in ("a", "b"))
     seen = np.flatnonzero(a_seen & b_seen)
-    found, ends = found.rows(seen), np.column_stack([a, b])[seen]
+    return found.rows(seen), np.column_stack([a, b])[seen]
+
+
+def _edges(
+    connection: Connection, view: View, node_keys: NDArray[np.int64], node_list: tuple[Node, ...]
+) -> EdgeTable:
+    found, ends = edges_between(connection, view, node_keys)
     codes, texts = found.texts["kind"]
     numbers = [EDGE_KINDS.index(member(EdgeKind, text, "edges")) for text in texts]
     return EdgeTable(

@@ -16,7 +16,6 @@ from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
 from typing import Any
-from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,7 @@ from engram.counts import counted
 from engram.errors import InputError, extra
 from engram.files import check_output
 from engram.graph.clock import hour_of_day
-from engram.graph.model import NodeId, Session
+from engram.graph.model import Session
 from engram.maps.difference import MapDifference
 from engram.maps.map import Map
 from engram.maps.placed import PlacedNodes
@@ -37,7 +36,7 @@ PALETTE = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#8c6bb1", "#7f7f00",
 )  # fmt: skip
 GOOD, BRIDGED, LOST = "#009e73", "#e69f00", "#d55e00"
-_FEW = "0.6"
+_FEW = "#999999"
 # What stands in a drawing for a page's colours of text, of lesser text and of its background.
 _INK, _MUTED, _PAPER = "#010203", "#040506", "#fcfdfe"
 # A legend longer than this hides the map.
@@ -155,15 +154,6 @@ class Track:
     colour: str | None = None
     chain: NDArray[np.int64] | None = None
     starts: NDArray[np.bool_] | None = None
-
-    def only(self, chosen: NDArray[np.bool_]) -> Track:
-        """The (N,) bool chosen points of it."""
-        return replace(
-            self,
-            points_m=self.points_m[chosen],
-            chain=None if self.chain is None else self.chain[chosen],
-            starts=None if self.starts is None else self.starts[chosen],
-        )
 
     def lines(self) -> list[NDArray[np.float64]]:
         """The (K, 2) points of each line, metres in the map frame, K >= 2."""
@@ -324,29 +314,94 @@ COLOURS: Mapping[str, Callable[[PlacedNodes], list[str]]] = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MapParts:
-    """A map from above: its parts, whose places relative to each other are unknown.
+class Labels:
+    """What the N nodes of a map are coloured by: L labels, each with its colour.
 
     Attributes:
-        panels: the largest parts, one panel each.
-        nodes: in all of them.
-        undrawn: parts that are not drawn, and their nodes.
-        part: (N,) int64 of each placed node, 0 the largest part.
-        positions_m: (N, 2) float64, x and y in the map frame, metres.
+        names: of the most frequent labels, by name; last the others together, if there are more.
+        colours: of each label, as CSS and Matplotlib write them.
+        of_node: (N,) int64, the label of each node.
     """
 
-    panels: list[Panel]
-    nodes: int
-    undrawn: tuple[int, int]
+    names: tuple[str, ...]
+    colours: tuple[str, ...]
+    of_node: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapAbove:
+    """What pictures and pages show of a map from above: its N placed nodes, part by part.
+
+    Attributes:
+        placed: the nodes.
+        points_m: (N, 2) float64, x and y in the map frame, metres.
+        part: (N,) int64, number of the part of each node, 0 the largest. How two parts lie to each
+            other is unknown.
+        starts: (N,) bool, the first node of each drive.
+        goals: part and x and y in the map frame, metres, by name.
+    """
+
+    placed: PlacedNodes
+    points_m: NDArray[np.float64]
     part: NDArray[np.int64]
-    positions_m: NDArray[np.float64]
+    starts: NDArray[np.bool_]
+    goals: Mapping[str, tuple[int, float, float]]
+
+    def sizes(self) -> list[int]:
+        """Number of nodes of each part."""
+        return [int(count) for count in np.bincount(self.part)]
+
+    def labels(self, by: str) -> Labels:
+        """What colours the nodes, by a key of `COLOURS`."""
+        names = np.array(COLOURS[by](self.placed), dtype=str)
+        counts = Counter(names.tolist())
+        largest = sorted(name for name, _ in counts.most_common(_NAMED))
+        place = {name: number for number, name in enumerate(largest)}
+        of_node = np.array([place.get(name, len(largest)) for name in names.tolist()], np.int64)
+        colours = [PALETTE[number % len(PALETTE)] for number in range(len(largest))]
+        if len(counts) > len(largest):
+            largest.append(f"{len(counts) - len(largest)} more")
+            colours.append(_FEW)
+        return Labels(tuple(largest), tuple(colours), of_node)
+
+
+def map_above(opened: Map) -> MapAbove:
+    """A map from above, as of its revision."""
+    placed = opened.placed()
+    part = _by_size(placed.component)
+    part_of = {uuid.tobytes(): int(number) for uuid, number in zip(placed.uuids, part, strict=True)}
+    goals = {}
+    for name, goal in sorted(opened.goals.items()):
+        place = opened.frame.locate(goal)
+        goals[name] = part_of[goal.node.bytes], place.x_m, place.y_m
+    return MapAbove(placed, placed.positions[:, :2], part, _starts(placed), goals)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapParts:
+    """A drawing of a map from above, a panel for each of its largest parts.
+
+    Attributes:
+        above: the map.
+        panels: the largest parts, one panel each.
+    """
+
+    above: MapAbove
+    panels: list[Panel]
+
+    @property
+    def nodes(self) -> int:
+        """Of all parts."""
+        return len(self.above.part)
 
     def text(self) -> str:
         """What the drawing leaves out; "" if nothing."""
-        parts, nodes = self.undrawn
-        if not parts:
+        left_out = self.above.sizes()[_PARTS:]
+        if not left_out:
             return ""
-        return f"{counted(parts, 'smaller part')} ({counted(nodes, 'node')}) not drawn"
+        return (
+            f"{counted(len(left_out), 'smaller part')} ({counted(sum(left_out), 'node')}) not drawn"
+        )
 
 
 def parts_of(opened: Map, by: str = "experience", title: str = "") -> MapParts:
@@ -356,39 +411,32 @@ def parts_of(opened: Map, by: str = "experience", title: str = "") -> MapParts:
         by: key of `COLOURS`.
         title: of the drawing.
     """
-    placed, graph = opened.placed(), opened.graph
-    at = np.array([graph.index(NodeId(UUID(bytes=one.tobytes()))) for one in placed.uuids], int)
-    part = _by_size(graph.components()[at])
-    points, labels = placed.positions[:, :2], np.array(COLOURS[by](placed), dtype=str)
-    whole = Track("", points, None, graph.experiences[at].astype(np.int64), _starts(placed))
-    count = int(part.max(initial=-1)) + 1
+    above = map_above(opened)
+    labels, sizes = above.labels(by), above.sizes()
     panels = [
-        Panel(_part_title(title, number, count, int((part == number).sum())), tracks)
-        for number in range(min(count, _PARTS))
-        if (tracks := _tracks(whole, labels, part == number))
+        Panel(
+            _part_title(title, number, len(sizes), size),
+            _tracks(above, labels, above.part == number),
+            {name: (x, y) for name, (part, x, y) in above.goals.items() if part == number},
+        )
+        for number, size in enumerate(sizes[:_PARTS])
     ]
-    marks: list[dict[str, tuple[float, float]]] = [{} for _ in panels]
-    for name, goal in sorted(opened.goals.items()):
-        of_goal = int(part[np.flatnonzero(at == graph.index(goal.node))[0]])
-        if of_goal < len(panels):
-            place = opened.frame.locate(goal)
-            marks[of_goal][name] = (place.x_m, place.y_m)
-    drawn = [replace(panel, marks=some) for panel, some in zip(panels, marks, strict=True)]
-    undrawn = max(count - _PARTS, 0), int((part >= _PARTS).sum())
-    return MapParts(drawn or [Panel(title, [])], len(part), undrawn, part, points)
+    return MapParts(above, panels or [Panel(title, [])])
 
 
-def _tracks(whole: Track, labels: NDArray[np.str_], chosen: NDArray[np.bool_]) -> list[Track]:
-    """The chosen points, (N,) bool, a track for each of the most frequent labels of all."""
+def _tracks(above: MapAbove, labels: Labels, chosen: NDArray[np.bool_]) -> list[Track]:
+    """The chosen points, (N,) bool, a track for each label."""
     tracks = []
-    for label, colour, which in _named(labels):
-        if count := int((which & chosen).sum()):
-            named = f"{label} ({counted(count, 'node')})"
-            tracks.append(replace(whole.only(which & chosen), label=named, colour=colour))
+    for number, (name, colour) in enumerate(zip(labels.names, labels.colours, strict=True)):
+        which = chosen & (labels.of_node == number)
+        if count := int(which.sum()):
+            chains = above.placed.experience[which]
+            label = f"{name} ({counted(count, 'node')})"
+            tracks.append(Track(label, above.points_m[which], colour, chains, above.starts[which]))
     return tracks
 
 
-def _by_size(components: NDArray[np.int32]) -> NDArray[np.int64]:
+def _by_size(components: NDArray[np.int64]) -> NDArray[np.int64]:
     """(N,) int64 numbers of (N,) components, the largest 0."""
     _, which, counts = np.unique(components, return_inverse=True, return_counts=True)
     rank = np.empty(len(counts), np.int64)
@@ -403,18 +451,6 @@ def _starts(placed: PlacedNodes) -> NDArray[np.bool_]:
     _, first = np.unique(placed.session[order], return_index=True)
     starts[order[first]] = True
     return starts
-
-
-def _named(labels: NDArray[np.str_]) -> list[tuple[str, str | None, NDArray[np.bool_]]]:
-    """The labels of most points with a colour and their points, and the others together."""
-    counts = Counter(labels.tolist())
-    largest = sorted(label for label, _ in counts.most_common(_NAMED))
-    found: list[tuple[str, str | None, NDArray[np.bool_]]]
-    found = [(label, None, labels == label) for label in largest]
-    if len(counts) > len(largest):
-        rest = ~np.isin(labels, largest)
-        found.append((f"{len(counts) - len(largest)} more", _FEW, rest))
-    return found
 
 
 def _part_title(title: str, number: int, count: int, nodes: int) -> str:
@@ -550,9 +586,9 @@ def draw_course(parts: MapParts, course: Course) -> Any:
 
     known = np.asarray(np.isfinite(course.places_m).all(axis=1), bool)
     of = np.full(len(known), -1, np.int64)
-    if len(parts.part) and known.any():
-        _, nearest = cKDTree(parts.positions_m).query(course.places_m[known])
-        of[known] = parts.part[nearest]
+    if parts.nodes and known.any():
+        _, nearest = cKDTree(parts.above.points_m).query(course.places_m[known])
+        of[known] = parts.above.part[nearest]
     panels = []
     for number, panel in enumerate(parts.panels):
         grey = [replace(track, label="", colour=_FEW) for track in panel.tracks]
