@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import httpx
 import pytest
 from tests.centre.conftest import Site, admit_here, drive
@@ -12,10 +15,12 @@ from engram.errors import ConfigError, IncompatibleError, InputError, MapError, 
 from engram.fleet.agent.agent import Agent
 from engram.fleet.agent.agent_state import AgentSettings, AgentState
 from engram.fleet.agent.centre_link import CentreRefusedError, Unreachable, enrol
-from engram.fleet.centre import merge_job
+from engram.fleet.centre import handins, jobs, merge_job
+from engram.fleet.centre.problems import UnknownError
 from engram.fleet.centre.serving import back_up
-from engram.fleet.cli.agent_verbs import _open, sync
-from engram.fleet.transfers import Manifest, PartHash, encode_manifest, part_hash
+from engram.fleet.centre.tables import HandIn
+from engram.fleet.cli.agent_verbs import _open, _status_lines, sync
+from engram.fleet.transfers import SHORT, Manifest, PartHash, encode_manifest, part_hash
 from engram.maps.map import Map
 
 
@@ -276,7 +281,7 @@ def test_an_agent_that_runs_tells_what_it_does(site, caplog):
     site.link.fates = ["lost"]
     first.step()
     drive(first.live, "r1", 1_000)
-    key = first.hand_in()[:12]
+    key = first.hand_in()[:SHORT]
     site.settle()
     assert second.switch()
     told = [record.getMessage() for record in caplog.records if "engram.fleet.agent" in record.name]
@@ -286,6 +291,40 @@ def test_an_agent_that_runs_tells_what_it_does(site, caplog):
     assert f"hand-in {key}: settled, in revision 1" in told
     version = second.status()["runs"]
     assert f"version {version} is ready: the robot takes it when it is parked" in told
+
+
+def test_a_hand_in_has_one_id_on_both_sides(site):
+    agent = site.robot("r1")
+    drive(agent.live, "r1", 1_000)
+    key = agent.hand_in()
+    site.settle()
+    (row,) = handins.listed(site.centre, "fleet")
+    assert row.id == key == agent.status()["outbox"][0]["id"]
+    assert jobs.named(site.centre, HandIn, key[:SHORT]) == row
+    with pytest.raises(UnknownError, match="no hand-in ''"):
+        jobs.named(site.centre, HandIn, "")
+
+
+def test_a_status_tells_what_matters(site):
+    first, second = site.robot("r1"), site.robot("r2")
+    drive(first.live, "r1", 1_000)
+    key = first.hand_in()[:SHORT]
+
+    def lines(agent: Agent) -> list[str]:
+        told = _status_lines(agent.status(), Path("r2"))
+        return [re.sub(r"\d+\.\d MB", "1 MB", line) for line in told[1:]]
+
+    own = "drives with its own map: it has taken none from the centre yet"
+    assert lines(first) == [f"hand-in {key} (1 MB): to be sent", own]
+    site.settle()
+    kept = "merged in revision 1, kept until a backup of the centre holds it"
+    assert lines(first)[0] == f"hand-in {key} (1 MB): {kept}"
+    parked = "revision 1 is ready: when the robot is parked, engram agent switch r2"
+    assert lines(second) == [own, parked]
+    second.switch()
+    second.drove(0.97, 1200.0)
+    localised = "with it 97% of the frames localised over 1200 m"
+    assert lines(second) == ["runs revision 1", localised]
 
 
 def test_after_a_fall_back_only_what_is_new_is_handed_in(site):
@@ -317,7 +356,7 @@ def test_a_sync_that_failed_tells_scripts_so(site, capsys):
         sync(agent.folder)
     assert isinstance(told.value.error, Unreachable)
     assert told.value.done["failures"] == 1
-    assert "failures: 1" in capsys.readouterr().out
+    assert "the last round failed: the centre cannot be reached" in capsys.readouterr().out
 
 
 def test_half_an_enrolment_a_lost_key_and_a_file_in_the_way_are_named(site, tmp_path):

@@ -37,6 +37,8 @@ PartHash = NewType("PartHash", bytes)
 PAGE_BYTES = 8192
 # Of one part: the longest attempts of a session and the vocabulary fit.
 MAX_PART_BYTES = 16 * 2**20
+# So many characters of an id are shown: the centre finds a hand-in by them.
+SHORT = 8
 # Columns whose values are parts of their own.
 BLOBS: dict[Table, tuple[str, ...]] = {frames: ("landmarks", "thumbnail"), vocabularies: ("body",)}
 TABLES: dict[str, Table] = {table.name: table for table in EXCHANGED}
@@ -48,6 +50,17 @@ _encode = msgspec.msgpack.Encoder().encode
 def part_hash(body: bytes) -> PartHash:
     """The name of a part."""
     return PartHash(hashlib.sha256(body).digest())
+
+
+def handin_id(name: str, robot: str, manifest: str) -> str:
+    """The name of a hand-in, which robot and centre both compute.
+
+    Args:
+        name: of the map.
+        robot: its id.
+        manifest: id of the manifest.
+    """
+    return hashlib.sha256(f"{name} {robot} {manifest}".encode()).hexdigest()[:32]
 
 
 def encode_pages(rows: Iterable[Sequence[Any]]) -> Iterator[bytes]:

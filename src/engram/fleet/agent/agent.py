@@ -33,7 +33,7 @@ from engram.files import WriterLock
 from engram.fleet.agent.agent_state import AgentSettings
 from engram.fleet.agent.centre_link import FOLDERS, CentreLink, enrolled, new_client, signer_of
 from engram.fleet.agent.fetching import fetch_map
-from engram.fleet.agent.outbox import FAILED, QUEUED, SENT, Outbox
+from engram.fleet.agent.outbox import QUEUED, SENT, Outbox
 from engram.maps.map import Map
 from engram.maps.map_files import check_file, copy_map
 
@@ -108,7 +108,7 @@ class Agent:
         """Queues what the live map holds; call it after each drive. No link is needed.
 
         Returns:
-            The hand-in; None if nothing is new, or there is no map yet.
+            Its id at the centre; None if nothing is new, or there is no map yet.
 
         Raises:
             StorageFullError: the outbox is full; the live map keeps everything.
@@ -187,7 +187,7 @@ class Agent:
             "runs": facts.runs,
             "localised_share": facts.share,
             "driven_m": facts.driven_m,
-            "outbox": sum(entry.state != FAILED for entry in self.state.outbox()),
+            "outbox": sum(entry.state in {QUEUED, SENT} for entry in self.state.outbox()),
             "told": (facts.trouble or "")[:500],
         }
 
@@ -298,7 +298,7 @@ class Agent:
         facts = self.state.facts
         outbox = [
             {
-                "id": entry.id,
+                "id": self.outbox.name_of(entry.id),
                 "state": entry.state,
                 "bytes": entry.size_bytes,
                 "revision": entry.revision,

@@ -15,11 +15,13 @@ from engram.errors import StorageFullError
 from engram.fleet.agent.agent_state import AgentState, OutboxEntry
 from engram.fleet.agent.centre_link import CentreLink, CentreRefusedError
 from engram.fleet.transfers import (
+    SHORT,
     Manifest,
     PartHash,
     Split,
     decode_manifest,
     encode_manifest,
+    handin_id,
     split,
 )
 
@@ -48,7 +50,10 @@ class Outbox:
         self._whole: Split | None = None
 
     def queue(self) -> str | None:
-        """Queues what the robot's map holds now; None if nothing is new since the last time.
+        """Queues what the robot's map holds now.
+
+        Returns:
+            The id of the hand-in at the centre; None if nothing is new since the last time.
 
         Raises:
             StorageFullError: the outbox would take more than it may; nothing is lost, the map
@@ -70,7 +75,15 @@ class Outbox:
             )
         self._state.queue(key, encode_manifest(taken.manifest), parts)
         self._state.remember(last_queued=key)
-        return key
+        return self.name_of(key)
+
+    def name_of(self, manifest: str) -> str:
+        """The id at the centre of the hand-in of a manifest."""
+        return handin_id(self._map, self._state.facts.robot or "", manifest)
+
+    def _told(self, entry: OutboxEntry) -> str:
+        """A hand-in in the log."""
+        return f"hand-in {self.name_of(entry.id)[:SHORT]}"
 
     def _make_room(self, size: int) -> int:
         """Drops what the centre did not take, oldest first, as far as needed; bytes then kept."""
@@ -80,7 +93,7 @@ class Outbox:
             refused = entry.state in {FAILED, SETTLED} and entry.revision is None
             if refused and kept + size > self._limit_bytes:
                 self._state.forget_outbox(entry.id)
-                _log.info("hand-in %s, not taken by the centre, makes room", entry.id[:12])
+                _log.info("%s, not taken by the centre, makes room", self._told(entry))
                 kept -= entry.size_bytes
         return kept
 
@@ -115,7 +128,7 @@ class Outbox:
             return
         self._state.set_outbox(entry.id, state, revision, why)
         merged = "" if revision is None else f", in revision {revision}"
-        _log.info("hand-in %s: %s%s%s", entry.id[:12], state, merged, f": {why}" if why else "")
+        _log.info("%s: %s%s%s", self._told(entry), state, merged, f": {why}" if why else "")
 
     def _queued(self) -> set[PartHash]:
         entries = self._state.outbox()
@@ -127,7 +140,7 @@ class Outbox:
         answer = self._begin(link, manifest)
         key = answer["id"]
         if answer["wanted"]:
-            _log.info("hand-in %s: sending", entry.id[:12])
+            _log.info("%s: sending", self._told(entry))
         while answer["wanted"]:
             before = set(answer["wanted"])
             wanted = [PartHash(bytes.fromhex(part)) for part in answer["wanted"]]
@@ -189,7 +202,7 @@ class Outbox:
         revision = answer["revision"]
         if answer["state"] == "merged" and revision is not None and revision <= durable_revision:
             self._state.forget_outbox(entry.id)
-            _log.info("hand-in %s: in a backup, no longer kept here", entry.id[:12])
+            _log.info("%s: in a backup, no longer kept here", self._told(entry))
         elif answer["state"] in _ENDED_BADLY:
             self._note(entry, FAILED, None, answer["error"])
         elif answer["state"] in {"merged", "refused"}:

@@ -5,7 +5,7 @@ A hand-in is its manifest, of one robot, on one map: begun twice it is the same.
 
 from __future__ import annotations
 
-import hashlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -46,15 +46,11 @@ from engram.fleet.transfers import (
     decode_manifest,
     decode_page,
     encode_manifest,
+    handin_id,
 )
 from engram.maps.schema import frames, nodes, sessions, vocabularies
 
 _PAGED = {table.name: table for table in (sessions, nodes, frames, vocabularies)}
-
-
-def handin_id(name: str, robot: str, manifest: str) -> str:
-    """The name of a hand-in, which both sides can compute."""
-    return hashlib.sha256(f"{name} {robot} {manifest}".encode()).hexdigest()[:32]
 
 
 def begin(centre: Centre, name: str, robot: str, sent: WireManifest) -> HandIn:
@@ -151,6 +147,14 @@ def listed(
         where.append(handins.c.state == state)
     newest = (handins.c.begun_ns.desc(), handins.c.id)
     return centre.database.rows(HandIn, *where, order=newest, limit=limit)
+
+
+def kept_by_robots(centre: Centre, name: str) -> Counter[str]:
+    """How many merged hand-ins of a map each robot keeps, since no backup holds them yet."""
+    late = handins.c.revision > centre.map_row(name).durable_revision
+    merged = select(handins.c.robot).where(handins.c.map == name, late)
+    with centre.database.reading() as connection:
+        return Counter(connection.execute(merged).scalars())
 
 
 def complete(centre: Centre, row: HandIn) -> HandIn:

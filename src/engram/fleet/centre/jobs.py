@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy import Connection, update
 
+from engram.errors import InputError
 from engram.fleet.centre.database import first_row, note, notify
 from engram.fleet.centre.problems import UnknownError
 from engram.fleet.centre.service import Centre
@@ -44,6 +45,20 @@ def get(centre: Centre, kind: type[Job], key: str) -> Job:
     if row is None:
         raise UnknownError(f"there is no {_NOUNS[kind]} {key!r:.40}")
     return row
+
+
+def named(centre: Centre, kind: type[Job], beginning: str) -> Job:
+    """A job by its id, or enough of its beginning.
+
+    Raises:
+        UnknownError: there is none.
+        InputError: several begin so.
+    """
+    begins = TABLES[kind].c.id.startswith(beginning, autoescape=True)
+    found = centre.database.rows(kind, begins)
+    if len(found) > 1:
+        raise InputError(f"{len(found)} ids begin with {beginning!r:.40}: give more of it")
+    return found[0] if found and beginning else get(centre, kind, beginning)
 
 
 def pending(centre: Centre, kind: type[Job], name: str | None = None) -> list[Job]:

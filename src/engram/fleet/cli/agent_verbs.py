@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
@@ -125,9 +125,14 @@ def hand_in(folder: Folder) -> None:
     Examples:
       engram agent hand-in r1
     """
+    from engram.fleet.transfers import SHORT
+
     with _open(folder) as agent:
         key = agent.hand_in()
-    typer.echo("nothing new to hand in" if key is None else f"queued {key[:12]}")
+    if key is None:
+        typer.echo("nothing new to hand in")
+    else:
+        typer.echo(f"hand-in {key[:SHORT]} is queued: engram agent sync {folder} sends it")
 
 
 @agent_group.command()
@@ -200,13 +205,50 @@ def status(folder: Folder, *, as_json: options.Json = False) -> None:
 
 def _print(agent: Agent, *, as_json: bool) -> None:
     found = agent.status()
-    lines = [
-        f"{name}: {'-' if value in (None, '') else value}"
-        for name, value in found.items()
-        if name != "outbox"
-    ]
-    lines += [
-        f"outbox {row['id'][:12]} {row['state']} {row['bytes']} bytes {row['error'] or ''}"
-        for row in found["outbox"]
-    ]
-    options.show(found, "\n".join(lines), as_json=as_json)
+    options.show(found, "\n".join(_status_lines(found, agent.folder)), as_json=as_json)
+
+
+def _status_lines(found: dict[str, Any], folder: Path) -> list[str]:
+    """What `Agent.status` reports, without what is as usual."""
+    lines = [f"{found['name']}, a robot of {found['map']} at {found['url']}"]
+    lines += [_handin_line(row) for row in found["outbox"]]
+    lines.append(_runs_line(found))
+    if found["staged"]:
+        ready = f"revision {_revision(found['staged'])} is ready"
+        lines.append(f"{ready}: when the robot is parked, engram agent switch {folder}")
+    if found["rejected"]:
+        lines.append(f"revision {_revision(found['rejected'])} served badly and is not taken again")
+    if found["share"] is not None:
+        share, driven_m = found["share"], found["driven_m"] or 0.0
+        lines.append(f"with it {share:.0%} of the frames localised over {driven_m:.0f} m")
+    if found["trouble"]:
+        lines.append(f"the last round failed: {found['trouble']}")
+    return lines
+
+
+def _runs_line(found: dict[str, Any]) -> str:
+    runs, wanted = found["runs"], found["wanted"]
+    if not runs:
+        return "drives with its own map: it has taken none from the centre yet"
+    newer = "" if wanted in {None, "0", runs} else f", is to run {_revision(wanted)}"
+    return f"runs revision {_revision(runs)}{newer}"
+
+
+def _revision(version: str) -> str:
+    """The number of the revision of a version."""
+    return version.split("-", maxsplit=1)[0]
+
+
+def _handin_line(row: dict[str, Any]) -> str:
+    """A hand-in in the outbox: where it is, and why it stays."""
+    from engram.fleet.agent.outbox import QUEUED, SENT, SETTLED
+    from engram.fleet.transfers import SHORT
+
+    size = f"{row['bytes'] / 1e6:.1f} MB"
+    if row["state"] == SETTLED and row["revision"] is not None:
+        fate = f"merged in revision {row['revision']}, kept until a backup of the centre holds it"
+    else:
+        fates = {QUEUED: "to be sent", SENT: "waits for the centre to merge it"}
+        fate = fates.get(row["state"], "not taken by the centre")
+    why = f": {row['error']}" if row["error"] else ""
+    return f"hand-in {row['id'][:SHORT]} ({size}): {fate}{why}"

@@ -170,8 +170,8 @@ def dream(
         if cancel is None:
             row = dreams.ask(centre, map_name, BY)
         else:
-            row = jobs.cancel(centre, jobs.get(centre, Dream, cancel), BY)
-    options.show(_plain(row), _line(row), as_json=as_json)
+            row = jobs.cancel(centre, jobs.named(centre, Dream, cancel), BY)
+    options.show(_plain(row), _line(row, "dream"), as_json=as_json)
 
 
 def jobs(
@@ -180,7 +180,7 @@ def jobs(
     map_name: MapName = "fleet",
     cancel: Annotated[
         str | None,
-        typer.Option("--cancel", metavar="JOB", help="Cancel this hand-in: its id as listed."),
+        typer.Option("--cancel", metavar="JOB", help="Cancel this hand-in, by its id as listed."),
     ] = None,
     as_json: options.Json = False,
 ) -> None:
@@ -193,16 +193,18 @@ def jobs(
     """
     from engram.fleet.centre import dreams, handins
     from engram.fleet.centre import jobs as any_job
+    from engram.fleet.centre.access import names_of
     from engram.fleet.centre.tables import HandIn
 
     with open_centre(folder) as centre:
         centre.map_row(map_name)
         if cancel is not None:
-            any_job.cancel(centre, any_job.get(centre, HandIn, cancel), BY)
+            any_job.cancel(centre, any_job.named(centre, HandIn, cancel), BY)
         rows = handins.listed(centre, map_name, limit=1000)
         dreamt = dreams.listed(centre, map_name)
-    lines = [_line(row) for row in reversed(rows)]
-    lines += [f"dream {_line(row)}" for row in reversed(dreamt)]
+        names = names_of(centre)
+    lines = [_line(row, f"hand-in of {names.get(row.robot, row.robot)}") for row in reversed(rows)]
+    lines += [_line(row, "dream") for row in reversed(dreamt)]
     found = {"jobs": list(map(_plain, rows)), "dreams": list(map(_plain, dreamt))}
     options.show(found, "\n".join(lines), as_json=as_json)
 
@@ -215,11 +217,13 @@ def _plain(row: HandIn | Dream) -> dict[str, Any]:
     return {**values_of(row), "report": report}
 
 
-def _line(row: HandIn | Dream) -> str:
+def _line(row: HandIn | Dream, what: str) -> str:
     """A job on one line."""
+    from engram.fleet.transfers import SHORT
+
     fact = row.error or row.progress or ""
-    revision = "" if row.revision is None else f" revision {row.revision}"
-    return f"{row.id} {row.state}{revision} {fact}".rstrip()
+    revision = "" if row.revision is None else f" in revision {row.revision}"
+    return f"{row.id[:SHORT]} {what}: {row.state}{revision} {fact}".rstrip()
 
 
 def serve(
