@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import shutil
 import threading
 
@@ -71,10 +72,16 @@ def page(browser, site, address):
 
 
 def test_the_map_by_keyboard_and_slider(page):
-    page.get_by_text("6 nodes", exact=True).wait_for()
-    page.focus("#canvas")
-    page.keyboard.press("n")
+    page.get_by_text("3 of 6 nodes, in part 1 of 2").wait_for()
+    page.get_by_text("How the parts lie to each other is unknown").wait_for()
+    held = queue.SimpleQueue()
+    page.route("**/nodes?at=*", lambda route: held.put(route, block=False))
+    page.reload()
+    page.get_by_text("loading…").wait_for()
+    page.keyboard.press("n")  # before the nodes came, and without a click on the drawing
+    held.get().continue_()
     page.wait_for_selector("#card dl")
+    page.unroute("**/nodes?at=*")
     assert "revision 1" in page.inner_text("#card")
     seen = page.locator("#card img")
     assert seen.evaluate("image => image.decode().then(() => image.naturalWidth)") > 0
@@ -82,13 +89,13 @@ def test_the_map_by_keyboard_and_slider(page):
     page.keyboard.press("ArrowLeft")
     page.get_by_text("3 nodes", exact=True).wait_for()
     page.select_option("#colour", "robot")
-    assert page.inner_text("#legend") == "r1 (3)"
+    assert page.inner_text("#legend li") == "r1 (3 nodes)"
 
 
 def test_a_version_for_a_robot_and_a_revert_with_its_preview(page, site):
     page.goto(f"/maps/{NAME}/history")
     page.get_by_text("What changed").first.click()
-    page.get_by_text("nodes 3 → 6: 3 added, 0 removed").wait_for()
+    page.get_by_text("3 nodes added: 6 in the map").wait_for()
     page.fill("input[name=ref]", "canary")
     page.fill("input[name=revision]", "1")
     with page.expect_navigation():
@@ -111,6 +118,7 @@ def test_a_version_for_a_robot_and_a_revert_with_its_preview(page, site):
     page.on("dialog", lambda one: (asked.append(one.message), one.accept()))
     with page.expect_navigation():
         page.click("[data-revert='2']")
-    assert asked == ["Hide what revision 2 added?"]
+    assert asked[0].startswith("Hide what revision 2 added: 3 nodes of r2?")
+    assert "3 nodes instead of 6" in asked[0]
     with Map.open(site.centre.map_path(NAME)) as store:
         assert (store.revision, store.node_count()) == (3, 3)

@@ -204,10 +204,18 @@ def wanted_by(centre: Centre, name: str, robot: str) -> Wanted:
 
 
 def note_report(centre: Centre, name: str, robot: str, report: dict[str, Any]) -> Wanted:
-    """Keeps what a robot runs and has localised with; returns what it is to run."""
-    of_robot = update(robots).where(robots.c.map == name, robots.c.robot == robot)
+    """Keeps what a robot runs and has localised with; returns what it is to run.
+
+    With it stays as `ran_before` the version that the robot ran before this one.
+    """
+    one = (robots.c.map == name, robots.c.robot == robot)
     with centre.database.writing(durable=False) as connection:
-        connection.execute(of_robot.values(report=report, reported_ns=centre.now_ns()))
+        row = first_row(connection, RobotOnMap, *one)
+        last = {} if row is None else row.report
+        same = last.get("runs") == report.get("runs")
+        before = last.get("ran_before") if same else last.get("runs")
+        change = {"report": {**report, "ran_before": before}, "reported_ns": centre.now_ns()}
+        connection.execute(update(robots).where(*one).values(**change))
     return wanted_by(centre, name, robot)
 
 

@@ -193,6 +193,8 @@ class Reverted(BaseModel):
 
     revision: Annotated[int | None, Field(examples=[8])]
     dry_run: bool
+    nodes: Annotated[dict[str, int], Field(examples=[{"before": 20_000, "after": 19_950}])]
+    components: Annotated[dict[str, int], Field(examples=[{"before": 1, "after": 2}])]
     lost_by_others: Annotated[dict[str, int], Field(examples=[{"edges": 2}])]
 
 

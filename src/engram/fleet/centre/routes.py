@@ -142,8 +142,14 @@ def revert(
         with centre.database.writing() as connection:
             detail = {"reverted": body.revision, "revision": number}
             note(connection, centre.now_ns(), who.id, "revert", name, **detail)
-    lost = dict(done.lost_by_others)
-    return models.Reverted(revision=number, dry_run=body.dry_run, lost_by_others=lost)
+    old, new = done.difference.old, done.difference.new
+    return models.Reverted(
+        revision=number,
+        dry_run=body.dry_run,
+        nodes={"before": old.nodes, "after": new.nodes},
+        components={"before": old.components, "after": new.components},
+        lost_by_others=dict(done.lost_by_others),
+    )
 
 
 @maps_router.get("/maps/{name}/events", dependencies=PEOPLE)

@@ -16,12 +16,13 @@ from markupsafe import Markup
 from engram.fleet.centre import dreams, handins, jobs
 from engram.fleet.centre.access import Role, Subject, names_of, subject_of
 from engram.fleet.centre.database import first_broken, newest_events
-from engram.fleet.centre.fleet import refs_of, revision_of, robots_of, version_of
-from engram.fleet.centre.pages.positions import drawn, thumbnail
+from engram.fleet.centre.fleet import RobotListed, refs_of, revision_of, robots_of, version_of
+from engram.fleet.centre.pages.positions import changes, drawn, thumbnail
 from engram.fleet.centre.problems import CentreError, UnknownError
 from engram.fleet.centre.requests import COOKIE, Asking, CentreHere, takes, who_asks
 from engram.fleet.centre.service import Centre
-from engram.fleet.centre.tables import Artifact, HandIn, values_of
+from engram.fleet.centre.tables import Artifact, HandIn
+from engram.fleet.transfers import SHORT
 from engram.maps.history import map_log
 from engram.untrusted import printable
 
@@ -29,7 +30,7 @@ router = APIRouter(include_in_schema=False)
 VIEWERS = [takes(Role.VIEWER)]
 _SHOWN = 200
 _LONGEST_LOGIN = 4096
-_STATIC = {"page.js": "text/javascript", "page.css": "text/css"}
+_STATIC = {"page.js": "text/javascript", "map.js": "text/javascript", "page.css": "text/css"}
 # Nothing comes from elsewhere, and nobody frames the pages.
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
@@ -43,14 +44,20 @@ _templates = Environment(
 )
 
 
-def _when(stamp_ns: int | None) -> str:
-    if not stamp_ns:
+def _when(stamp: int | str | None) -> str:
+    """A stamp, ns or ISO 8601; the page's script writes it in the reader's own time zone."""
+    if not stamp:
         return "never"
-    text = datetime.fromtimestamp(stamp_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
-    return Markup(f"<time>{text}</time>")  # digits and our own words
+    if isinstance(stamp, str):
+        then = datetime.fromisoformat(stamp)
+    else:
+        then = datetime.fromtimestamp(stamp / 1e9, UTC)
+    text = f"{then:%Y-%m-%d %H:%M} UTC"
+    return Markup(f'<time datetime="{then.isoformat()}" title="{text}">{text}</time>')
 
 
 _templates.filters["when"] = _when
+_templates.filters["short"] = lambda one: one[:SHORT]
 
 
 def _page(name: str, who: Subject | None, status: int = 200, **values: Any) -> HTMLResponse:
@@ -105,6 +112,15 @@ async def login(request: Request, centre: CentreHere) -> Response:
     return answer
 
 
+@router.post("/logout")
+def logout(request: Request) -> Response:
+    """Forgets the cookie. Other sites cannot log anybody out: browsers send them no cookie."""
+    answer = RedirectResponse("/", 303)
+    if COOKIE in request.cookies:
+        answer.delete_cookie(COOKIE, httponly=True, samesite="strict")
+    return answer
+
+
 @router.get("/maps/{name}/map", dependencies=VIEWERS)
 def map_page(name: str, centre: CentreHere, who: Asking) -> Response:
     """The map from above."""
@@ -134,10 +150,18 @@ def picture(
     return Response(body, media_type="image/jpeg")
 
 
+@router.get("/maps/{name}/revisions/{revision}/changes", dependencies=VIEWERS)
+def changed(name: str, revision: Annotated[int, Path(ge=1)], centre: CentreHere) -> dict[str, Any]:
+    """What a revision changed, in words and pictures."""
+    with centre.reading(name) as store:
+        return changes(store, store.resolve(revision))
+
+
 @router.get("/maps/{name}/history", dependencies=VIEWERS)
 def history(name: str, centre: CentreHere, who: Asking) -> Response:
     """Revisions, what merged them, refs."""
     rows = handins.listed(centre, name, limit=_SHOWN)
+    names = names_of(centre)
     return _page(
         "history",
         who,
@@ -145,35 +169,39 @@ def history(name: str, centre: CentreHere, who: Asking) -> Response:
         maps=_maps(centre, who),
         log=map_log(centre.map_path(name))[:_SHOWN],
         refs=refs_of(centre, name),
-        names=names_of(centre),
+        names=names,
         reports={row.revision: row.report for row in rows if row.report is not None},
-        may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
+        robots={row.revision: names.get(row.robot, row.robot) for row in rows},
+        may_operate=_may_operate(who, name),
     )
 
 
 @router.get("/maps/{name}/fleet", dependencies=VIEWERS)
 def robots(name: str, centre: CentreHere, who: Asking) -> Response:
     """What every robot runs, and wants."""
-    rows, named = [], Counter[str]()
-    for row in robots_of(centre, name):
-        try:
-            revision = revision_of(centre, name, row.follows)
-            wanted = version_of(centre, name, revision)
-        except UnknownError:
-            revision, wanted = None, None
-        named[row.name] += 1
-        up_to_date = row.report.get("runs") == wanted
-        rows.append({**values_of(row), "wanted": revision, "up_to_date": up_to_date})
+    listed = robots_of(centre, name)
     return _page(
         "robots",
         who,
         map=name,
         maps=_maps(centre, who),
-        robots=rows,
-        named=named,
+        robots=[(row, _wanted(centre, row)) for row in listed],
+        named=Counter(row.name for row in listed),
+        kept=handins.kept_by_robots(centre, name),
         refs=[ref.name for ref in refs_of(centre, name)],
-        may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
+        code_days=centre.settings.code_days,
+        may_operate=_may_operate(who, name),
+        may_admin=who.role_on(name) is Role.ADMIN,
     )
+
+
+def _wanted(centre: Centre, row: RobotListed) -> tuple[int | None, str | None]:
+    """Revision and version that a robot is to run; None where its ref is not made yet."""
+    try:
+        revision = revision_of(centre, row.map, row.follows)
+        return revision, version_of(centre, row.map, revision)
+    except UnknownError:
+        return None, None
 
 
 @router.get("/maps/{name}/queue", dependencies=VIEWERS)
@@ -188,7 +216,7 @@ def queue(name: str, centre: CentreHere, who: Asking) -> Response:
         downloads=jobs.pending(centre, Artifact, name),
         dreams=dreams.listed(centre, name),
         robots={row.robot: row.name for row in robots_of(centre, name)},
-        may_operate=who.role_on(name) in {Role.OPERATOR, Role.ADMIN},
+        may_operate=_may_operate(who, name),
     )
 
 
@@ -212,6 +240,10 @@ def health(name: str, centre: CentreHere, who: Asking) -> Response:
         silent=[row for row in robots_of(centre, name) if row.reported_ns is None],
         names=names_of(centre),
     )
+
+
+def _may_operate(who: Subject, name: str) -> bool:
+    return who.role_on(name) in {Role.OPERATOR, Role.ADMIN}
 
 
 def _maps(centre: Centre, who: Subject) -> list[str]:

@@ -1,52 +1,56 @@
-"""Where a map's nodes are drawn, and what colours them."""
+"""What the page of a map shows: its nodes from above, part by part; pictures; what changed."""
 
 from __future__ import annotations
 
 import json
 from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 from uuid import UUID
 
 import numpy as np
 
-from engram.graph.clock import hour_of_day
+from engram.counts import counted
+from engram.maps.difference import MapDifference, Region
 from engram.maps.map import Map
+from engram.untrusted import printable
+from engram.viewing.drawings import COLOURS, map_above
+from engram.viewing.moments import drive_text
 
 _KEPT = 8
+# Of nodes that a revision added.
+_PICTURES = 4
 
 
 @lru_cache(maxsize=_KEPT)
 def drawn(path: Path, version: str, revision: int) -> bytes:
-    """The nodes of a revision as JSON, in the map frame; kept by version."""
+    """A revision from above as JSON, a list for each column of its nodes; kept by version."""
     del version  # names the revision permanently; after a restore the number alone does not
     with Map.open(path, at=revision) as store:
-        placed = store.placed()
-    sessions = placed.sessions
-    columns = (placed.session, placed.stamp_ns, placed.revision)
-    found = [
-        [
-            str(UUID(bytes=uuid.tobytes())),
-            x_m,
-            y_m,
-            session,
-            number,
-            _hour(sessions[session], stamp_ns),
-        ]
-        for uuid, (x_m, y_m), session, stamp_ns, number in zip(
-            placed.uuids,
-            np.round(placed.positions[:, :2], 2).tolist(),
-            *(column.tolist() for column in columns),
-            strict=True,
-        )
-    ]
+        above = map_above(store)
+    placed = above.placed
+    labels = {by: above.labels(by) for by in COLOURS}
+    x_m, y_m = np.round(above.points_m, 2).T.tolist()
     body: dict[str, Any] = {
         "revision": revision,
-        "sessions": [
-            {"id": str(session.id), "robot": session.robot, "start_ns": session.start_ns}
-            for session in sessions
-        ],
-        "nodes": found,
+        "parts": above.sizes(),
+        "goals": [[printable(name), *goal] for name, goal in above.goals.items()],
+        "by": {
+            by: {
+                "names": [printable(name) for name in one.names],
+                "colours": one.colours,
+                "of": one.of_node.tolist(),
+            }
+            for by, one in labels.items()
+        },
+        "node": [str(UUID(bytes=uuid.tobytes())) for uuid in placed.uuids],
+        "x": x_m,
+        "y": y_m,
+        "part": above.part.tolist(),
+        "chain": placed.experience.tolist(),
+        "added": placed.revision.tolist(),
+        "starts": np.flatnonzero(above.starts).tolist(),
     }
     return json.dumps(body, separators=(",", ":")).encode()
 
@@ -60,6 +64,34 @@ def thumbnail(store: Map, node: str) -> bytes | None:
     return next(iter(store.frames.stored([record]))).thumbnail
 
 
-def _hour(session: Any, stamp_ns: int) -> float | None:
-    hour = hour_of_day(session, stamp_ns)
-    return None if hour is None else round(float(hour), 2)
+def changes(store: Map, revision: int) -> dict[str, Any]:
+    """What a revision changed: lines for people, and some of the nodes that it added."""
+    found = store.diff(max(revision - 1, 0), revision)
+    added = sorted(str(node) for node in found.added)
+    return {"lines": change_lines(found), "nodes": added[:_PICTURES]}
+
+
+def change_lines(found: MapDifference) -> list[str]:
+    """What changed between two revisions, a fact a line."""
+    old, new = found.old, found.new
+    nodes = _moved(len(found.added), len(found.removed)) or "no node added or removed"
+    lines = [f"{nodes}: {new.nodes} in the map"]
+    if old.nodes and round(new.mapped_m) != round(old.mapped_m):
+        lines.append(f"{old.mapped_m:.0f} m of road mapped before, {new.mapped_m:.0f} m after")
+    if old.nodes and new.components != old.components:
+        lines.append(f"{counted(old.components, 'part')} before, {new.components} after")
+    for _, stretches in groupby(found.regions, lambda one: (one.part, one.oldest.id)):
+        lines.append(_region_line(list(stretches)))
+    return lines
+
+
+def _region_line(stretches: list[Region]) -> str:
+    moved = _moved(sum(one.added for one in stretches), sum(one.removed for one in stretches))
+    first_m, last_m = stretches[0].from_m, stretches[-1].to_m
+    drive = drive_text(stretches[0].oldest)
+    return f"{moved} between {first_m:.0f} and {last_m:.0f} m into the drive of {drive}"
+
+
+def _moved(added: int, removed: int) -> str:
+    counts = (("added", added), ("removed", removed))
+    return ", ".join(f"{counted(count, 'node')} {what}" for what, count in counts if count)
