@@ -11,13 +11,13 @@ from dataclasses import replace
 import httpx
 import pytest
 import uvicorn
-from sqlalchemy import delete, insert
+from sqlalchemy import delete, func, insert, select
 
 from engram.errors import ConfigError, InputError
 from engram.fleet.agent.centre_link import CentreRefusedError, enrol
 from engram.fleet.centre import dreams, serving
 from engram.fleet.centre.access import Role, add_person, disable, new_code, revoke_access
-from engram.fleet.centre.database import _hash, first_broken
+from engram.fleet.centre.database import AuditCheck, _hash
 from engram.fleet.centre.fleet import robots_of
 from engram.fleet.centre.problems import UnknownError
 from engram.fleet.centre.serving import Listening, serve
@@ -236,9 +236,33 @@ def test_the_audit_log_shows_what_was_changed_in_it(site):
     site.robot("r1")
     disable(site.centre, "nobody", "tests")
     with site.centre.database.writing() as connection:
-        assert first_broken(connection) is None
+        assert AuditCheck().first_broken(connection, 0) is None
         connection.execute(audit.update().where(audit.c.number == 2).values(subject="me"))
-        assert first_broken(connection) == 2
+        assert AuditCheck().first_broken(connection, 0) == 2
+
+
+def test_a_service_reads_the_audit_log_once_and_all_of_it_once_an_hour(site):
+    site.robot("r1")
+    check, hour_ns = AuditCheck(), 3_600_000_000_000
+    now_ns = 10 * hour_ns
+    change = audit.update().values(subject="me")
+    with site.centre.database.writing() as connection:
+        assert check.first_broken(connection, now_ns) is None
+        connection.execute(change.where(audit.c.number == 1))
+        assert check.first_broken(connection, now_ns + hour_ns) is None
+        assert check.whole_ns == now_ns
+        assert check.first_broken(connection, now_ns + hour_ns + 1) == 1
+        assert check.first_broken(connection, now_ns + hour_ns + 1) == 1
+
+
+def test_what_follows_a_changed_row_is_noticed_at_once(site):
+    site.robot("r1")
+    check = AuditCheck()
+    with site.centre.database.writing() as connection:
+        assert check.first_broken(connection, 1) is None
+        last = audit.c.number == select(func.max(audit.c.number)).scalar_subquery()
+        connection.execute(audit.update().where(last).values(hash="another"))
+        assert check.first_broken(connection, 2) is not None
 
 
 def test_a_long_audit_log_is_checked_in_little_memory(site):
@@ -252,7 +276,7 @@ def test_a_long_audit_log_is_checked_in_little_memory(site):
         connection.execute(insert(audit), rows)
         del rows
         tracemalloc.start()
-        assert first_broken(connection) is None
+        assert AuditCheck().first_broken(connection, 0) is None
         assert tracemalloc.get_traced_memory()[1] < 2_000_000  # all rows at once are 2.8
         tracemalloc.stop()
 

@@ -332,6 +332,8 @@ class WorkListener:
 
 
 _log = logging.getLogger(__name__)
+# All rows of the audit log are read again so often.
+_WHOLE_EVERY_NS = 3_600_000_000_000
 
 
 def note(
@@ -379,16 +381,47 @@ def _shown(row: Event) -> dict[str, Any]:
     return {**values_of(row), "detail": json.loads(row.detail)}
 
 
-def first_broken(connection: Connection) -> int | None:
-    """Number of the first row that was changed, removed or added later; None for a whole log."""
-    before = ""
-    query = select(audit).order_by(audit.c.number).execution_options(yield_per=1000)
-    for number, values in enumerate(connection.execute(query), 1):
-        row = Event(*values)
-        if row.number != number or row.hash != _hash(before, row):
-            return number
-        before = row.hash
-    return None
+class AuditCheck:
+    """Checks the audit log for a service: all rows once an hour, in between those that came since.
+
+    A row that was changed with all that follow is found at once, by the last one that was
+    checked; a row that was changed alone within the hour.
+
+    Attributes:
+        whole_ns: when all rows were read last.
+    """
+
+    def __init__(self) -> None:
+        self.whole_ns = 0
+        self._lock = threading.Lock()
+        self._last = (0, "")
+
+    def first_broken(self, connection: Connection, now_ns: int) -> int | None:
+        """Number of the first row that was changed, removed or slipped in; None for a whole log."""
+        with self._lock:
+            if now_ns - self.whole_ns > _WHOLE_EVERY_NS or not self._last_holds(connection):
+                self._last, self.whole_ns = (0, ""), now_ns
+            broken = self._read_on(connection)
+            if broken is not None:
+                self._last, self.whole_ns = (0, ""), 0
+            return broken
+
+    def _last_holds(self, connection: Connection) -> bool:
+        number, checked = self._last
+        query = select(audit.c.hash).where(audit.c.number == number)
+        return number == 0 or connection.execute(query).scalar() == checked
+
+    def _read_on(self, connection: Connection) -> int | None:
+        """Checks the rows after the last one; None if they follow."""
+        number, before = self._last
+        query = select(audit).where(audit.c.number > number).order_by(audit.c.number)
+        for values in connection.execute(query.execution_options(yield_per=1000)):
+            row, number = Event(*values), number + 1
+            if row.number != number or row.hash != _hash(before, row):
+                return number
+            before = row.hash
+        self._last = number, before
+        return None
 
 
 def _hash(before: str, row: Event) -> str:

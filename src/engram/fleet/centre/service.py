@@ -18,7 +18,7 @@ from sqlalchemy import URL, Connection, Select, func, select, update
 from engram.config import check_bounds, from_dict, to_dict
 from engram.errors import InputError, MapLockedError
 from engram.files import WriterLock
-from engram.fleet.centre.database import ServiceDatabase, note
+from engram.fleet.centre.database import AuditCheck, ServiceDatabase, note
 from engram.fleet.centre.objects import BucketObjects, FolderObjects, Objects, Packs
 from engram.fleet.centre.problems import UnknownError
 from engram.fleet.centre.tables import JobState, MapListed, artifacts, handins, maps, refs
@@ -244,6 +244,7 @@ class Centre:
         self.objects: Objects = (
             FolderObjects(self.folder / "objects") if objects is None else BucketObjects(objects)
         )
+        self.audit = AuditCheck()
         self._packs: dict[str, Packs] = {}
         self._open_maps = OpenMaps()
 

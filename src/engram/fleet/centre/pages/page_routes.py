@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from engram.fleet.centre import dreams, handins, jobs
 from engram.fleet.centre.access import Role, Subject, names_of, subject_of
-from engram.fleet.centre.database import first_broken, newest_events
+from engram.fleet.centre.database import newest_events
 from engram.fleet.centre.fleet import RobotListed, refs_of, revision_of, robots_of, version_of
 from engram.fleet.centre.pages.positions import changes, drawn, thumbnail
 from engram.fleet.centre.problems import CentreError, UnknownError
@@ -224,7 +224,7 @@ def queue(name: str, centre: CentreHere, who: Asking) -> Response:
 def health(name: str, centre: CentreHere, who: Asking) -> Response:
     """Whether all is well, and the last changes of state."""
     with centre.database.reading() as connection:
-        broken = first_broken(connection)
+        broken = centre.audit.first_broken(connection, centre.now_ns())
         events = newest_events(connection, name, _SHOWN)
         path = centre.map_path(name)
     return _page(
@@ -233,6 +233,7 @@ def health(name: str, centre: CentreHere, who: Asking) -> Response:
         map=name,
         maps=_maps(centre, who),
         broken=broken,
+        whole_ns=centre.audit.whole_ns,
         events=events,
         waiting=jobs.pending(centre, HandIn, name),
         size_bytes=path.stat().st_size if path.exists() else 0,
