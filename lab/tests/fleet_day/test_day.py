@@ -141,11 +141,10 @@ def test_the_day_comes_to_its_end(tmp_path: Path) -> None:
     assert report.cuts > 20
     assert report.revisions >= 4
     assert all(one.received_bytes > 100_000 for one in report.forays)
-    # What others saw helps: nowhere is less localised than with the own map, somewhere more, and
-    # what is known need not be saved. Rounding may decide of two frames of a drive's 185.
+    # Each has mapped half of the round: the other half is what it gains.
     gains = [one.shared.localised - one.alone.localised for one in report.forays]
-    assert min(gains) >= -2 / 185
-    assert max(gains) > 2 / 185
+    assert min(gains) > 0.2
+    assert report.forays[1].shared.localised > 0.75  # in rain
     spared = [one.alone.added - one.shared.added for one in report.forays]
-    assert min(spared) >= -2
-    assert max(spared) > 2
+    assert max(spared) > 10
+    assert all(one.why for one in report.forays)

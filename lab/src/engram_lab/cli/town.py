@@ -236,8 +236,8 @@ def fleet_day(
 ) -> None:
     """Let three robots share a map through a centre.
 
-    Each drives, hands in over a link that breaks every 200 kB, downloads what its next mission
-    needs, and drives again.
+    Each maps half of a round, hands in over a link that breaks every 200 kB, downloads what its
+    next mission needs, and drives the whole round.
 
     \b
     Examples:
@@ -261,6 +261,9 @@ def fleet_day(
         typer.echo(f"http://127.0.0.1:8440 with the token {report.token}; Ctrl-C ends it")
         with Centre(out / "centre") as centre:
             run(centre, listening)
+    elif not as_json:
+        typer.echo(f"next: engram centre serve {out / 'centre'}")
+        typer.echo(f"  and open http://127.0.0.1:8440 with the token {report.token}")
 
 
 def _show_day(report: DayReport) -> None:
@@ -287,6 +290,8 @@ def _show_day(report: DayReport) -> None:
         table.add_section()
     console = Console(file=drawing(sys.stdout))
     console.print(table)
+    for one in report.forays:
+        typer.echo(f"{one.robot}: {one.why}")
     typer.echo(
         f"{report.nodes} nodes in {report.revisions} revisions; {report.passed_bytes / 1e6:.1f} MB "
         f"passed the link, which broke {report.cuts} times; {report.faults} faults in any map"

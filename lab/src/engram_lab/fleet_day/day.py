@@ -1,4 +1,8 @@
-"""Three robots of the hamlet drive, hand in over a link that breaks, download, and drive again."""
+"""Three robots of the hamlet share what they map, over a link that breaks.
+
+Each maps half of the round. Then each drives all of it: with its own map, and with a download of
+the fleet's.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +29,7 @@ from engram.fleet.centre.merge_job import merge_hand_in
 from engram.fleet.centre.service import Centre
 from engram.fleet.centre.worker import work_off
 from engram.geometry.se3 import SE3
+from engram.graph.model import NodeId
 from engram.localiser.localisation import Position
 from engram.maps.map import Map
 from engram.maps.map_files import check_file, copy_map
@@ -60,6 +65,7 @@ class Foray:
     """One robot's second drive, with either map, and the day's traffic.
 
     Attributes:
+        why: what it knew and what it met, which explain its result.
         sent_bytes, received_bytes: bodies of all its requests and answers, what was sent again
             included.
     """
@@ -69,29 +75,53 @@ class Foray:
     alone: Drive
     shared: Drive
     fell_back: bool
+    why: str
     sent_bytes: int
     received_bytes: int
 
 
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A robot's two forays.
+
+    Attributes:
+        first, second: drives of the campaign.
+        frames: of the first that it drives: its own stretch of the round.
+        download: what it downloads in between; options of ``engram download``.
+        why: what it knows and what it meets, which explain its result.
+    """
+
+    first: int
+    frames: str
+    second: int
+    download: dict[str, Any]
+    why: str
+
+
 class DayRobot:
-    """A robot that has enrolled."""
+    """A robot that has enrolled.
+
+    Attributes:
+        yard: the node where all forays over the whole round begin, if somebody has mapped it.
+    """
 
     def __init__(self, folder: Path, centre: Centre, monitor: Monitor) -> None:
         self.name = folder.name
+        self.yard: NodeId | None = None
         self.live = folder / "live" / MAP
         self._folder = folder
         self._centre = centre
         self._monitor = monitor
         self._sent = self._received = 0
 
-    def drive(self, log: Path, path: Path | None = None) -> Drive:
-        """Drives with the live map, or with another one."""
+    def drive(self, log: Path, path: Path | None = None, frames: str | None = None) -> Drive:
+        """Drives some or all frames of a log, with the live map or with another one."""
         path = path or self.live
         held = _nodes(path)
-        sequence = open_drive(log, robot=self.name)
+        sequence = open_drive(log, robot=self.name, frames=frames)
         whose = f"{held} nodes" if held else "no map yet"
         with self._monitor.stage(f"{self.name} drives {log.stem}, {whose}", len(sequence)) as part:
-            found = map_drive(path, sequence, monitor=part, begin=_place_at_yard)
+            found = map_drive(path, sequence, monitor=part, begin=self._place_at_yard)
         if found.interrupted:
             raise KeyboardInterrupt
         return Drive(held, found.to_dict()["share_localised"], found.saved)
@@ -113,8 +143,9 @@ class DayRobot:
             if not agent.switch():
                 raise EngramError(f"{self.name} did not switch: {agent.status()}")
 
-    def second_foray(self, log: Path, options: dict[str, Any]) -> Foray:
+    def second_foray(self, log: Path, plan: Plan) -> Foray:
         """Drives with its own map alone, then with a download; hands in the second."""
+        options = plan.download
         own = self._folder / "alone.engram"
         copy_map(self.live, own)
         alone = self.drive(log, own)
@@ -129,9 +160,16 @@ class DayRobot:
             alone,
             shared,
             fell_back,
+            plan.why,
             self._sent,
             self._received,
         )
+
+    def _place_at_yard(self, foray: Beginning) -> None:
+        """Robots are parked in the yard: one whose map contains it begins there."""
+        if self.yard is not None and self.yard in foray.opened.graph and not foray.resumed:
+            covariance = np.diag([_YARD_M**2] * 3 + [_YARD_RAD**2] * 3)
+            foray.robot.place_at(Position(self.yard, SE3.identity(), covariance))
 
     @contextmanager
     def _agent(self, download: dict[str, Any]) -> Iterator[Agent]:
@@ -173,15 +211,6 @@ def _nodes(path: Path) -> int:
         return 0
     with Map.open(path) as store:
         return store.node_count()
-
-
-def _place_at_yard(foray: Beginning) -> None:
-    """A foray begins as a drive that the map holds began, if it holds a start."""
-    starts = (node.id for node in foray.opened.graph.nodes if node.driven_m < _YARD_M)
-    first = next(starts, None)
-    if first is not None and not foray.resumed:
-        covariance = np.diag([_YARD_M**2] * 3 + [_YARD_RAD**2] * 3)
-        foray.robot.place_at(Position(first, SE3.identity(), covariance))
 
 
 def _length_m(log: Path) -> float:
@@ -287,12 +316,24 @@ _CAMPAIGN, _MAP = "hamlet", "fleet"
 _CUT_BYTES = 200_000
 # Open requests at the end of the day are not waited for any longer.
 _FAREWELL_S = 5
-# First and second foray of each robot, and what it downloads in between.
-_ROBOTS: dict[str, tuple[int, int, dict[str, Any]]] = {
-    "r1": (0, 3, {"select": "copy"}),
-    "r2": (1, 4, {"select": "tod+paths", "depart_h": 10.0, "arrive_h": 11.0, "buffer_min": 120.0}),
-    "r3": (2, 5, {"select": "budget", "budget_percent": 50.0, "depart_h": 9.0}),
-}
+_ROBOTS = {
+    "r1": Plan(
+        0, "0:100", 3, {"select": "copy"},
+        "It mapped the first half of the round by day. Now it drives all of it at night, which no "
+        "robot has mapped yet.",
+    ),
+    "r2": Plan(
+        1, "85:185", 4,
+        {"select": "tod+paths", "depart_h": 10.0, "arrive_h": 11.0, "buffer_min": 120.0},
+        "It mapped the second half on a dry day. Now it drives all of it in rain, with what the "
+        "others saved within two hours of its own.",
+    ),
+    "r3": Plan(
+        2, "40:140", 5, {"select": "budget", "budget_percent": 50.0, "depart_h": 9.0},
+        "It mapped the middle, which the others had handed in. Now it drives all of it by day, "
+        "with the half of the fleet's map that serves it best.",
+    ),
+}  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -344,11 +385,15 @@ def run_day(
                     out / "robots" / robot.name, f"http://127.0.0.1:{link.port}", code, robot.name
                 )
             for robot in robots:
-                robot.drive(logs[_ROBOTS[robot.name][0]])
+                plan = _ROBOTS[robot.name]
+                robot.drive(logs[plan.first], frames=plan.frames)
                 robot.hand_in("first")
+            with Map.open(robots[0].live) as store:
+                yard = store.graph.node(0).id
             for robot in robots:
-                _, second, options = _ROBOTS[robot.name]
-                report.forays.append(robot.second_foray(logs[second], options))
+                robot.yard = yard
+                plan = _ROBOTS[robot.name]
+                report.forays.append(robot.second_foray(logs[plan.second], plan))
             report.cuts, report.passed_bytes = link.cuts, link.passed_bytes
         _look_over(report, centre.map_path(_MAP), [robot.live for robot in robots], stages)
     return report
