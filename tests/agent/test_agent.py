@@ -16,6 +16,7 @@ from engram.fleet.agent.agent import Agent
 from engram.fleet.agent.agent_state import AgentSettings, AgentState
 from engram.fleet.agent.centre_link import CentreRefusedError, Unreachable, enrol
 from engram.fleet.centre import handins, jobs, merge_job
+from engram.fleet.centre.fleet import robots_of
 from engram.fleet.centre.problems import UnknownError
 from engram.fleet.centre.serving import back_up
 from engram.fleet.centre.tables import HandIn
@@ -300,6 +301,7 @@ def test_a_hand_in_has_one_id_on_both_sides(site):
     site.settle()
     (row,) = handins.listed(site.centre, "fleet")
     assert row.id == key == agent.status()["outbox"][0]["id"]
+    assert [robot.report["outbox"] for robot in robots_of(site.centre, "fleet")] == [0]
     assert jobs.named(site.centre, HandIn, key[:SHORT]) == row
     with pytest.raises(UnknownError, match="no hand-in ''"):
         jobs.named(site.centre, HandIn, "")

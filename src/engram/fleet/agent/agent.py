@@ -147,10 +147,12 @@ class Agent:
             Seconds until the next round.
         """
         try:
-            path = f"/v1/maps/{self._map}/robots/me/report"
-            wanted = self.link.ask("PUT", path, self._report())
+            path, report = f"/v1/maps/{self._map}/robots/me/report", self._report()
+            wanted = self.link.ask("PUT", path, report)
             self.state.remember(wanted=wanted["version"], durable=wanted["durable_revision"])
             busy = self.outbox.send(self.link, wanted["durable_revision"])
+            if self._report() != report:  # what is settled is no longer to be handed in
+                self.link.ask("PUT", path, self._report())
             busy = (fetch and self._fetch(wanted["revision"], wanted["version"])) or busy
             self.state.remember(failures=0, trouble="")
         except (EngramError, OSError) as error:

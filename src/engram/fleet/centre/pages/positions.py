@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from functools import lru_cache
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 from uuid import UUID
@@ -80,14 +79,15 @@ def change_lines(found: MapDifference) -> list[str]:
         lines.append(f"{old.mapped_m:.0f} m of road mapped before, {new.mapped_m:.0f} m after")
     if old.nodes and new.components != old.components:
         lines.append(f"{counted(old.components, 'part')} before, {new.components} after")
-    for _, stretches in groupby(found.regions, lambda one: (one.part, one.oldest.id)):
-        lines.append(_region_line(list(stretches)))
-    return lines
+    drives = dict.fromkeys(one.oldest.id for one in found.regions)
+    return lines + [
+        _region_line([one for one in found.regions if one.oldest.id == drive]) for drive in drives
+    ]
 
 
 def _region_line(stretches: list[Region]) -> str:
     moved = _moved(sum(one.added for one in stretches), sum(one.removed for one in stretches))
-    first_m, last_m = stretches[0].from_m, stretches[-1].to_m
+    first_m, last_m = min(one.from_m for one in stretches), max(one.to_m for one in stretches)
     drive = drive_text(stretches[0].oldest)
     return f"{moved} between {first_m:.0f} and {last_m:.0f} m into the drive of {drive}"
 
