@@ -31,7 +31,7 @@ from engram.maps.forgetting import Chosen, Erased, Forgotten, erase_map
 from engram.maps.map import Map
 
 _NS_PER_DAY = 86_400 * 10**9
-# Bytes of a node besides its landmarks and picture. Source: lab/reports/performance.md.
+# Bytes of a node besides its landmarks and picture, about: its rows, edges and attempts, indexed.
 _NODE_BYTES = 2600
 
 

