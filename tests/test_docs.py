@@ -37,6 +37,7 @@ PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.g
 SLOW = {"afternoon", "operate", "budget", "fleet-tutorial", "trouble"}
 EXAMPLES = {
     README: "drives",
+    DOCS / "index.md": "nothing",
     DOCS / "first-map.md": "nothing",
     DOCS / "fleet-tutorial.md": "nothing",
     DOCS / "afternoon.md": "nothing",
