@@ -28,6 +28,8 @@ _GREY = (140, 140, 140)
 _JPEG_QUALITY = 80
 # Positions of the driven path that are sent again with each new one.
 _STRIP = 50
+# Width that the map's pane shows of a map without nodes yet.
+_LEAST_SHOWN_M = 20.0
 
 
 # What ``--view`` takes in place of a file.
@@ -72,11 +74,24 @@ class Viewer:
         self.show(opened, robot.graph)
         robot.watch = self.see
 
+    def _arrange(self, positions: NDArray[np.float64], *, robot: bool) -> None:
+        """Lays out the panes: the map from above, and what is seen of a robot that drives in it."""
+        import rerun.blueprint as rrb
+
+        eye = rrb.EyeControls3D(**_from_above(positions))
+        panes = rrb.Spatial3DView(origin="map", name="Map from above", eye_controls=eye)
+        if robot:
+            image = rrb.Spatial2DView(origin="live/image", name="Image, and what matched of it")
+            sure = rrb.TimeSeriesView(origin="confidence", name="Confidence, log-odds")
+            matched = rrb.TimeSeriesView(origin="inliers", name="Inliers of the best match")
+            panes = rrb.Horizontal(rrb.Vertical(image, rrb.Tabs(sure, matched)), panes)
+        self._stream.send_blueprint(rrb.Blueprint(panes, collapse_panels=True))
+
     def show(self, opened: Map, graph: ExperienceGraph | None = None) -> None:
         """Shows a map, in which the next frames are; the one before goes.
 
         Args:
-            graph: with what a robot saves; None for that of the map.
+            graph: with what a robot saves; None for that of the map, in which none drives.
         """
         self._display_pose = DisplayPose(opened.frame, opened.graph if graph is None else graph)
         self._driven = []
@@ -84,7 +99,9 @@ class Viewer:
         for node in opened.graph.nodes:
             numbers.setdefault(node.session, len(numbers))
         colours = [_hue(numbers[node.session]) for node in opened.graph.nodes]
-        points = self._rr.Points3D(opened.layout().positions, colors=colours, radii=0.3)
+        positions = opened.layout().positions
+        self._arrange(positions, robot=graph is not None)
+        points = self._rr.Points3D(positions, colors=colours, radii=0.3)
         self._stream.log("map/nodes", points, static=True)
         goals = {name: opened.frame.locate(goal) for name, goal in opened.goals.items()}
         stars = self._rr.Points3D(
@@ -110,7 +127,6 @@ class Viewer:
         stream.log("live/image/landmarks", rr.Points2D(pixels, colors=_GREY, radii=1.0))
         inliers = pixels[:0] if best is None else pixels[best.match.live_rows]
         stream.log("live/image/inliers", rr.Points2D(inliers, colors=colour, radii=2.0))
-        stream.log("status", rr.TextLog(localisation.status.value, color=colour))
         stream.log("confidence", rr.Scalars(max(localisation.confidence, -20.0)))
         stream.log("inliers", rr.Scalars(localisation.inliers))
         self._show_candidates(seen)
@@ -154,6 +170,15 @@ def viewer_on(view: Path) -> Viewer:
     if view.suffix != ".rrd":
         raise InputError(f"--view {view}: give window, or a file to write, NAME.rrd")
     return Viewer(view)
+
+
+def _from_above(positions: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """An eye over the middle of a map, so high that all (N, 3) positions are in view; y is up."""
+    low, high = (positions.min(0), positions.max(0)) if len(positions) else np.zeros((2, 3))
+    middle = (low + high) / 2
+    height_m = max(float((high - low)[:2].max()), _LEAST_SHOWN_M)
+    above, ahead = np.array([0.0, 0.0, height_m]), np.array([0.0, 1.0, 0.0])
+    return {"position": middle + above, "look_target": middle, "eye_up": ahead}
 
 
 def _rerun() -> Any:
