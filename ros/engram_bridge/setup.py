@@ -1,5 +1,7 @@
 """Installs the bridge: colcon build --packages-select engram_msgs engram_bridge."""
 
+from glob import glob
+
 from setuptools import setup
 
 NAME = "engram_bridge"
@@ -11,8 +13,8 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/" + NAME]),
         ("share/" + NAME, ["package.xml"]),
-        ("share/" + NAME + "/launch", ["launch/engram.launch.py"]),
-        ("share/" + NAME + "/config", ["config/engram.yaml", "config/fastdds.xml"]),
+        ("share/" + NAME + "/launch", glob("launch/*.launch.py")),
+        ("share/" + NAME + "/config", glob("config/*")),
     ],
     install_requires=["setuptools", "numpy"],
     zip_safe=True,

@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -25,6 +26,7 @@ from engram.frontend.frame import StereoPair
 from engram.geometry.se3 import SE3
 from engram.localiser.localisation import LocalisationStatus
 from engram.robot.mapping import map_drive
+from engram.sequences.bags.topics import IMAGE, StereoTopics, info_topics, stereo_topics
 from engram.sequences.opening import open_drive
 
 PACKAGE = Path(__file__).parents[2] / "ros" / "engram_bridge"
@@ -420,6 +422,61 @@ def test_the_launch_file_starts_the_installed_program_with_known_parameters(
     assert f"{node['executable']} = engram_bridge.node:main" in (PACKAGE / "setup.py").read_text()
     assert set(node["parameters"][1]) <= set(PARAMETERS)
     assert set(node["parameters"][1]) <= set(arguments)
+
+
+class _Chosen:
+    """A launch configuration, as `launch` resolves it in a context."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def perform(self, context: dict[str, str]) -> str:
+        return context[self.name]
+
+
+@pytest.mark.parametrize("camera", ["realsense", "zed", "oak"])
+def test_each_camera_starts_with_topics_that_the_bridge_and_the_reader_know(
+    monkeypatch: pytest.MonkeyPatch, camera: str
+) -> None:
+    """Topics and parameters are the drivers' by their sources; no camera was at hand."""
+    for name, held in {
+        "ament_index_python.packages": {
+            "get_package_share_directory": lambda one: str(
+                PACKAGE if one == "engram_bridge" else Path("/drivers") / one
+            )
+        },
+        "launch": {"LaunchDescription": list},
+        "launch.actions": {
+            "DeclareLaunchArgument": lambda name, **k: name,
+            "GroupAction": lambda actions: actions[-1],
+            "IncludeLaunchDescription": lambda file, launch_arguments: (
+                Path(file),
+                dict(launch_arguments),
+            ),
+            "OpaqueFunction": lambda function: function,
+        },
+        "launch.launch_description_sources": {"PythonLaunchDescriptionSource": lambda file: file},
+        "launch.substitutions": {"LaunchConfiguration": _Chosen},
+        "launch_ros.actions": {"SetParameter": lambda **k: k},
+    }.items():
+        monkeypatch.setitem(sys.modules, name, SimpleNamespace(**held))
+    made = runpy.run_path(str(PACKAGE / "launch" / "camera.launch.py"))
+    *arguments, starts = made["generate_launch_description"]()
+    context = {**dict.fromkeys(arguments, ""), "camera": camera}
+    (driver, given), (bridge, to_bridge) = starts(context)
+    assert driver.parts[1:3] == ("drivers", made["DRIVERS"][camera][0])
+    files = [Path(one) for one in given.values() if one.endswith(".yaml")]
+    assert all(yaml.safe_load(one.read_text()) for one in files)
+    assert bridge.is_file()
+    assert set(to_bridge) <= {"map", "mapping", "config"} <= set(arguments)
+    parameters = yaml.safe_load(Path(to_bridge["config"]).read_text())["engram"]["ros__parameters"]
+    assert set(parameters) <= set(PARAMETERS)
+    left, right = parameters["left"], parameters["right"]
+    found = stereo_topics(dict.fromkeys((left, right), SimpleNamespace(type=IMAGE, count=1)))
+    assert (found.left, found.right) == (left, right)
+    assert found.are_rectified
+    infos = info_topics(found, (parameters["left_info"], parameters["right_info"]))
+    assert infos == StereoTopics(parameters["left_info"], parameters["right_info"])
 
 
 def test_the_report_never_pretends() -> None:
