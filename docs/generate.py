@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ def write_references(folder: Path) -> None:
     for name, text in (
         ("commands", commands()),
         ("settings", settings()),
-        ("python", public_names()),
         ("findings", findings()),
         ("tables", tables()),
     ):
@@ -73,27 +73,44 @@ def findings() -> str:
     return "\n".join(rows) + "\n"
 
 
-def public_names() -> str:
-    """What `import engram` offers: signatures and docstrings."""
-    parts = []
-    for name in engram.__all__:
-        thing = getattr(engram, name)
-        if name.startswith("__"):
+def write_api(folder: Path) -> None:
+    """Writes a page for each public module: signatures and docstrings of its `__all__`."""
+    folder.mkdir(exist_ok=True)
+    described: dict[int, str] = {}
+    for name in public_modules():
+        (folder / f"{name}.md").write_text(api_page(name, described), encoding="utf-8")
+
+
+def public_modules() -> list[str]:
+    """Names of the modules with an `__all__`, but for the command line, which has its own page."""
+    package = Path(engram.__file__).parent
+    files = (path for path in sorted(package.rglob("*.py")) if "\n__all__ = " in path.read_text())
+    named = (path.relative_to(package.parent).with_suffix("").parts for path in files)
+    names = [".".join(part for part in parts if part != "__init__") for parts in named]
+    return sorted(name for name in names if not name.startswith("engram.cli"))
+
+
+def api_page(name: str, described: dict[int, str]) -> str:
+    """A public module: what its docstring says, and each public name in reStructuredText.
+
+    Args:
+        described: name of each thing, by its id, that a page describes; gains those of this one.
+    """
+    module = import_module(name)
+    blocks = [f".. automodule:: {name}\n   :no-members:"]
+    for public in sorted(module.__all__):
+        thing = getattr(module, public)
+        if public.startswith("__"):
             continue
-        parts.append(f"### `{name}`")
-        parts.append(f"```text\n{inspect.getdoc(thing) or ''}\n```")
-        if not inspect.isclass(thing):
-            continue
-        for method, value in vars(thing).items():
-            documented = inspect.getdoc(value)
-            if method.startswith("_") or not callable(value) or documented is None:
-                continue
-            try:
-                signature = str(inspect.signature(value))
-            except ValueError:
-                continue
-            parts.append(f"```text\n{method}{signature}\n\n{documented}\n```")
-    return "\n\n".join(parts) + "\n"
+        full = f"{name}.{public}"
+        first = described.setdefault(id(thing), full)
+        if first != full:
+            blocks.append(f"{public}: see :py:obj:`{first}`.")
+        elif callable(thing):
+            blocks.append(f".. auto{'class' if inspect.isclass(thing) else 'function'}:: {full}")
+        else:
+            blocks.append(f".. py:data:: {full}\n   :type: {type(thing).__name__}")
+    return f"# {name}\n\n```{{eval-rst}}\n" + "\n\n".join(blocks) + "\n```\n"
 
 
 def tables() -> str:

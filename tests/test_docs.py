@@ -417,8 +417,26 @@ def test_every_setting_and_verb_is_in_the_generated_references() -> None:
         sys.path.remove(str(DOCS))
     assert "mapper.save_every_m" in generate.settings()
     assert "--recorded-at" in generate.commands()
-    assert "step" in generate.public_names()
+    assert ".. autoclass:: engram.Robot" in generate.api_page("engram", {})
     assert "`node_from_omitted` (transform)" in generate.tables()
+
+
+def test_pages_from_outside_keep_their_links_and_every_line() -> None:
+    sys.path.insert(0, str(DOCS))
+    try:
+        from outside import PAGES, on_the_site
+    finally:
+        sys.path.remove(str(DOCS))
+    report = Path("lab/reports/eyes.md")
+    assert on_the_site(
+        "100\n% of [it](method.md#a), [x](../../docs/how.md)", report, PAGES[report]
+    ) == ("100\n\\% of [it](method.md#a), [x](../how.md)")
+    page = Path("docs/eyes.md")
+    assert (
+        on_the_site("`lab/reports/eyes.md`", page, page)
+        == "[`lab/reports/eyes.md`](reports/eyes.md)"
+    )
+    assert on_the_site("[it](../CHANGELOG.md)", page, page) == "[it](project/changes.md)"
 
 
 @pytest.mark.skipif(find_spec("sphinx") is None, reason="needs the docs group: make docs")

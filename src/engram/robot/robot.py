@@ -63,7 +63,7 @@ class LastFrame:
 
 
 class Robot:
-    """One robot on one drive: image pairs in, `Localisation`s out. A context manager.
+    """One robot on one drive: image pairs in, one `Localisation` each out. A context manager.
 
     One thread at a time calls a robot's methods, all but `pose_at`. `RobotOptions.threads` bounds
     all that work for it: the caller's; one more for each further lane; one that decodes images in
