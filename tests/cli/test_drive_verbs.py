@@ -14,6 +14,7 @@ from tests.sequences.bag_maker import StereoBag, bag, rectified_infos
 
 from engram.calibration.formats import read_calibration
 from engram.errors import NotAMapError
+from engram.frontend.frontend import FrontendConfig
 from engram.geometry.cameras import StereoCamera
 from engram.maps.map import open_map
 from engram.sequences.opening import open_drive
@@ -254,3 +255,14 @@ def test_a_note_on_the_calibration_is_told_once(engram, street: Path, tmp_path: 
     assert mapped.status == 0
     assert mapped.err.count("note: the projections state") == 1
     assert engram("localise", tmp_path / "m.engram", street).out.count(" 0 localised") == 0
+
+
+def test_nodes_keep_the_landmarks_of_their_live_frames_where_further_ones_are_not_wanted(
+    engram, street: Path, tmp_path: Path
+) -> None:
+    done = engram("map", tmp_path / "town.engram", street, "--set", "mapper.landmarks=0", "--json")
+    assert done.status == 0, done.err
+    with open_map(tmp_path / "town.engram") as town:
+        nodes = [town.frames.frame(one.id) for one in town.load().nodes]
+    most = FrontendConfig().landmarks_for(nodes[0].camera.width * nodes[0].camera.height)
+    assert max(len(one.landmarks) for one in nodes) <= most

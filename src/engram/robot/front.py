@@ -154,8 +154,11 @@ class Front:
         """Takes a frame before the robot does, which is then given the result."""
         frame, motion = self._taken(arrived, outside, StageClock())
         self._ahead.append(motion)
-        if frame.further is not None:  # now: its images are not kept until the robot drives
-            further = frame.further(self._settings.mapper.landmarks_for(frame.camera))
+        most = self._settings.mapper.landmarks_for(frame.camera)
+        if not most:  # nodes keep the landmarks of their live frames
+            frame = replace(frame, further=None)
+        elif frame.further is not None:  # now: its images are not kept until the robot drives
+            further = frame.further(most)
             frame = replace(frame, further=lambda _: further)
         return LoggedFrame(frame, motion.odometry)
 
