@@ -1,9 +1,33 @@
 """What `import engram` offers, and what it costs."""
 
+import difflib
+import re
 import subprocess
 import sys
 
+from tests.public_surface import LISTING, MEMBERS, MODULES, surface
+
 import engram
+
+
+def test_what_is_promised_is_what_the_listing_says() -> None:
+    committed, found = LISTING.read_text(encoding="utf-8").splitlines(), surface()
+    changes = list(difflib.unified_diff(committed, found, "listed", "found", lineterm="", n=0))
+    assert not changes, "\n".join(
+        [
+            *changes,
+            "what goes or changes is deprecated first (CONTRIBUTING, Compatibility); then",
+            "python -m tests.public_surface writes the listing again",
+        ]
+    )
+
+
+def test_the_page_names_what_is_promised() -> None:
+    page = (LISTING.parents[1] / "docs" / "python.md").read_text()
+    named = set(re.findall(r"`([\w.]+)`", page))
+    assert set(MODULES) <= named
+    for members in MEMBERS.values():
+        assert members <= named
 
 
 def test_every_public_name_is_there() -> None:
