@@ -22,9 +22,7 @@ if TYPE_CHECKING:
     from engram.robot.settings import Settings
     from engram.sequences.opening import open_drive
 
-__version__ = "0.2.0a1"
-# Printed where somebody might rely on more: by `--version`, and beside a format that is refused.
-PRE_RELEASE = "a pre-release: map format, settings and Python names may change without notice"
+__version__ = "0.2.0"
 
 __all__ = [
     "SE3",

@@ -25,7 +25,7 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.pool import QueuePool
 from sqlalchemy.util import LRUCache
 
-from engram import PRE_RELEASE, __version__
+from engram import __version__
 from engram.errors import (
     EngramError,
     FormatVersionError,
@@ -139,8 +139,7 @@ class SqliteFile:
         if version > kind.format_version:
             raise FormatVersionError(
                 f"{self.path} is a {kind.noun} of format {version}, this Engram ({__version__}) "
-                f"reads up to {kind.format_version}: upgrade Engram "
-                f"({__version__} is {PRE_RELEASE})"
+                f"reads up to {kind.format_version}: upgrade Engram"
             )
         if version < 1:
             raise MapCorruptError(f"{self.path}: format {version} does not exist; {kind.cure}")

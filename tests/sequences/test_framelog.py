@@ -384,7 +384,7 @@ def test_a_newer_format_is_refused(tmp_path: Path) -> None:
     with sqlite3.connect(path) as database:
         database.execute("PRAGMA user_version = 99")
     database.close()
-    with pytest.raises(FormatVersionError, match=r"format 99.*upgrade.*pre-release"):
+    with pytest.raises(FormatVersionError, match=r"format 99.*upgrade Engram"):
         open_drive(path)
 
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, cast
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from engram import PRE_RELEASE, __version__
+from engram import __version__
 from engram.cli.drive import drive_group, live
 from engram.cli.drives import doctor, localise, map_, record
 from engram.cli.frame import anchor, export, goal
@@ -245,7 +245,7 @@ app = typer.Typer(
 
 def _print_version(asked: bool) -> None:
     if asked:
-        print(f"engram {__version__}, {PRE_RELEASE}")
+        print(f"engram {__version__}")
         raise typer.Exit
 
 

@@ -34,7 +34,7 @@ from sqlalchemy.dialects.postgresql import insert as insert_postgresql
 from sqlalchemy.dialects.sqlite import insert as insert_sqlite
 from sqlalchemy.exc import ArgumentError, DataError, DBAPIError
 
-from engram import PRE_RELEASE, __version__
+from engram import __version__
 from engram.errors import FormatVersionError, InputError, StorageFullError, extra
 from engram.fleet.centre.problems import StoreError
 from engram.fleet.centre.tables import (
@@ -160,10 +160,9 @@ class ServiceDatabase:
         version = connection.execute(select(centre.c.version)).scalar_one()
         if version != VERSION:
             raise FormatVersionError(
-                f"the centre's tables are of version {version}, Engram {__version__} "
-                f"({PRE_RELEASE}) uses {VERSION}: open it with the Engram that wrote it, or copy "
-                "its maps/*.engram into a new centre, give each to engram centre map, and enrol "
-                "the robots there"
+                f"the centre's tables are of version {version}, Engram {__version__} uses "
+                f"{VERSION}: open it with the Engram that wrote it, or copy its maps/*.engram into "
+                "a new centre, give each to engram centre map, and enrol the robots there"
             )
 
 
