@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
+from tests.cli.json_schemas import problems_of_line
 
 from engram.cli import main
 
@@ -38,6 +39,9 @@ def engram(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
         except SystemExit as exit_:
             status = int(exit_.code or 0)
         captured = capsys.readouterr()
-        return Ran(status, captured.out, captured.err)
+        ran = Ran(status, captured.out, captured.err)
+        if "--json" in sys.argv and ran.out:
+            assert problems_of_line(sys.argv[1:], ran.out) == []
+        return ran
 
     return run
