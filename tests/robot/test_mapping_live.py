@@ -10,6 +10,7 @@ from tests.builders import write_street
 from tests.goldens import through
 from tests.goldens.cases import DRIVE_0001, HAMLET, KITTI_06, ROOM, DrivesMissingError, data
 
+from engram.frontend.features import feature_kind
 from engram.maps.map import open_map
 from engram.robot.drive_session import RobotSetup
 from engram.robot.localisers import DriveSequence, session_of_drive
@@ -83,3 +84,10 @@ def test_live_and_recorded_mapping_of_the_same_frames_give_the_same_map(
     recorded = records_recorded(tmp_path / "recorded.engram", sequences)
     assert live["nodes"]
     assert live == recorded
+
+
+def test_a_new_map_has_the_features_that_are_asked_for(tmp_path: Path) -> None:
+    drive = through.drive(write_street(tmp_path / "street", frames=3))
+    map_drive(tmp_path / "town.engram", drive, features="net")
+    with open_map(tmp_path / "town.engram") as town:
+        assert town.descriptor == feature_kind("net").name

@@ -330,7 +330,8 @@ def map_drive(
                 report.known = True
                 return report
             report.resumed = opened.session_state(session.id) is SessionState.INTERRUPTED
-        settings = settings.for_descriptor(None if opened is None else opened.descriptor)
+        wanted = None if features is None else feature_kind(features).name
+        settings = settings.for_descriptor(wanted if opened is None else opened.descriptor)
         into = _written(map_path) if opened is None else nullcontext(opened)
         setup = RobotSetup(
             sequence.camera, settings, options, session.robot, session, fixes_of(sequence)
