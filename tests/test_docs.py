@@ -60,6 +60,7 @@ EXAMPLES = {
     DOCS / "papers.md": "fleet",
     DOCS / "live.md": "first map",
     DOCS / "commands.md": "drives",
+    DOCS / "compare.md": "nothing",
     DOCS / "settings.md": "drives",
     DOCS / "python.md": "drives",
 }

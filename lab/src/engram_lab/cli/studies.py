@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import json
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -748,3 +749,36 @@ def public(
         print(json.dumps({"page": str(page)}))
     else:
         typer.echo(f"{page.read_text(encoding='utf-8')}\n{page}")
+
+
+@evaluate.command("peers")
+def peers(
+    *,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="DIR", help="Maps, answers and the table.")
+    ] = Path("results/peers"),
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Of the town.")] = 21,
+    workers: Annotated[
+        int, typer.Option("--workers", metavar="N", min=1, help="Processes that render.")
+    ] = 2,
+    as_json: options.Json = False,
+) -> None:
+    """Compare Engram with other systems on equal drives.
+
+    Ten drives of a small simulated town, and the real clips that ENGRAM_DATA names: Engram with
+    both kinds of features, and SIFT, VLAD and PnP as in hloc, where pycolmap is installed. The
+    same command resumes a run that was stopped.
+
+    \b
+    Examples:
+      engram lab evaluate peers
+      engram lab evaluate peers --out results/peers22 --seed 22
+    """
+    from engram.cli.screen import Bars
+    from engram_lab.studies.peers import run_peers, text_of
+    from engram_lab.town.simulating import campaigns_folder
+
+    named = os.environ.get("ENGRAM_DATA")
+    data = Path(named) if named else None
+    rows = run_peers(out, campaigns_folder(), data, seed=seed, workers=workers, monitor=Bars())
+    typer.echo(json.dumps(rows) if as_json else f"{text_of(rows)}\n{out / 'peers.csv'}")
