@@ -15,6 +15,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from urllib.parse import unquote
 
 import cv2
 import numpy as np
@@ -454,3 +455,16 @@ def test_the_site_builds_strictly_and_fetches_nothing(tmp_path: Path) -> None:
             r'(?:src|href)="(https?://[^"]+\.(?:js|css|woff2?))"', page.read_text()
         )
         assert fetched == [], page.name
+    assert list(broken_links(tmp_path)) == []
+
+
+def broken_links(site: Path) -> Iterator[str]:
+    """Links of a built site to pages, files and anchors of its own that are not there."""
+    texts = {page.resolve(): page.read_text() for page in site.rglob("*.html")}
+    anchors = {page: set(re.findall(r'\bid="([^"]+)"', text)) for page, text in texts.items()}
+    for page, text in texts.items():
+        for link in set(re.findall(r'(?:href|src)="(?![a-z]+:)([^"]+)"', text)):
+            path, _, anchor = unquote(link.partition("?")[0]).partition("#")
+            target = (page.parent / path).resolve() if path else page
+            if not target.exists() or (anchor and anchor not in anchors.get(target, {anchor})):
+                yield f"{page.name}: {link}"
