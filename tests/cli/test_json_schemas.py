@@ -37,6 +37,7 @@ record STREET b.framelog --frames 1::3 --recorded-at 2026-03-06T12:00:00Z
 record STREET c.framelog --frames 2::3 --recorded-at 2026-03-02T12:00:00Z
 evaluate result.json --truth truth.tum
 report town.engram
+weak-spots town.engram
 info town.engram --sessions --nodes
 check town.engram
 check town.engram --seal

@@ -23,6 +23,7 @@ build: max_gap_m estimator
 download: window_min epoch_min best_percent buffer_min latitude_deg radius_m thumbnails
 repair: gross_m gross_rad
 islands: sigmas reach_m
+weak_spots: latitude_deg share_percent
 """
 # More than a person reads through.
 MOST = 80

@@ -23,6 +23,7 @@ from engram.cli.reports import evaluate, report
 from engram.cli.screen import UnwritableError, forget, screen
 from engram.cli.showing import features, settings
 from engram.cli.trying import try_
+from engram.cli.weakness import weak_spots
 from engram.errors import ConfigError, EngramError, IncompatibleError, InputError, UnfitDriveError
 from engram.fleet.cli.joined import FLEET_GROUPS, FLEET_VERBS
 from engram.plugins import PluginGroup
@@ -41,6 +42,7 @@ GROUPS: dict[str, dict[str, Callable[..., None]]] = {
     "Maps": {
         "info": info,
         "plot": plot,
+        "weak-spots": weak_spots,
         "view": view,
         "check": check,
         "amend": amend,

@@ -50,9 +50,9 @@ def report(
     """Make a page of a map, a drive or a result.
 
     One file to look at and to pass on: it needs no network and runs no script. Of a map it shows
-    the map from above, its drives and its history; of a drive what the doctor finds, with stereo
-    pairs; of a result where the drive was localised, by whose nodes, and the gaps. With pictures of
-    the matches: engram localise MAP DRIVE --report FILE.html.
+    the map from above, its weak spots, drives and history; of a drive what the doctor finds, with
+    stereo pairs; of a result where the drive was localised, by whose nodes, and the gaps. With
+    pictures of the matches: engram localise MAP DRIVE --report FILE.html.
 
     \b
     Examples:
@@ -68,7 +68,7 @@ def report(
     if path.suffix == ".json":
         page = _result_page(path)
     elif path.suffix == ".engram":
-        page = _map_page(path)
+        page = _map_page(path, settings)
     else:
         page = _drive_page(path, settings)
     page.write(place, made_by())
@@ -89,18 +89,19 @@ def _result_page(path: Path) -> Page:
         return drive_page(result, opened, None, lines)
 
 
-def _map_page(path: Path) -> Page:
+def _map_page(path: Path, settings: options.SettingsGiven) -> Page:
     from engram.files import map_path
     from engram.viewing.report import map_page, typed
 
     town = map_path(str(path))
     lines = [
         typed("engram", "plot", town, "map.png"),
+        typed("engram", "weak-spots", town),
         typed("engram", "check", town),
         typed("engram", "log", town),
         f"{typed('engram', 'localise', town)} DRIVE --report monday.html",
     ]
-    return map_page(town, lines)
+    return map_page(town, lines, settings.read().weak_spots)
 
 
 def _drive_page(path: Path, settings: options.SettingsGiven) -> Page:

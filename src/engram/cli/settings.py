@@ -22,6 +22,7 @@ from engram.frontend.frame import DescriptorKind
 from engram.repair.finding import RepairConfig
 from engram.robot.anchors import IslandsConfig
 from engram.robot.settings import Settings, settings_text
+from engram.weak_spots import WeakSpotsConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,6 +90,7 @@ class AllSettings(Settings):
     download: DownloadSettings = field(default_factory=DownloadSettings)
     repair: RepairConfig = field(default_factory=RepairConfig)
     islands: IslandsConfig = field(default_factory=IslandsConfig)
+    weak_spots: WeakSpotsConfig = field(default_factory=WeakSpotsConfig)
 
     def of_robot(self, descriptor: str | None = None) -> Settings:
         """The part that maps and results keep.

@@ -47,6 +47,8 @@ from engram.viewing.page import (
     table,
 )
 from engram.viewing.pictures import side_picture
+from engram.viewing.weakness import HEAD, advice_text, draw_weakness, spot_rows, verdict
+from engram.weak_spots import WeakSpots, WeakSpotsConfig, find_weak_spots
 
 # Pictures of each kind, and the distance between the frames that they show, metres.
 _PICTURES, _APART_M = 3, 8.0
@@ -265,8 +267,12 @@ def finding_section(findings: Sequence[Finding]) -> list[str]:
     return [*parts, table(("severity", "finding", "what", "cure"), rows, "Findings, worst first")]
 
 
-def map_page(path: Path, next_commands: Sequence[str]) -> Page:
-    """The page of a map."""
+def map_page(path: Path, next_commands: Sequence[str], weak: WeakSpotsConfig | None = None) -> Page:
+    """The page of a map.
+
+    Args:
+        weak: how its weak spots are found; None for the defaults.
+    """
     facts, sessions = describe_map(path), list_sessions(path)
     with Map.open(path) as opened:
         parts = parts_of(opened, title=f"{path.name}, revision {opened.revision}")
@@ -276,6 +282,7 @@ def map_page(path: Path, next_commands: Sequence[str]) -> Page:
             for one in reversed(opened.log()[-_LISTED:])
         ]  # fmt: skip
         named = {str(one.id): drive_text(one) for one in opened.sessions.values()}
+        weakness = _weak_section(find_weak_spots(opened, weak), opened)
     about = f"{path.name} from above: {counted(parts.nodes, 'node')} by drive"
     colours = "Colours: drives; arrows: their direction; rings: their starts."
     caption = f"{colours} {parts.text()}." if parts.text() else colours
@@ -305,6 +312,7 @@ def map_page(path: Path, next_commands: Sequence[str]) -> Page:
         figures(tiles),
         heading("From above"),
         drawing(as_svg(draw_parts(parts.panels), about), caption),
+        *weakness,
         heading("Drives"),
         table(head, rows[:_LISTED], f"Drives in order of arrival{_more(len(rows))}"),
         heading("History"),
@@ -313,6 +321,19 @@ def map_page(path: Path, next_commands: Sequence[str]) -> Page:
         commands(next_commands),
     ]
     return Page(path.name, verdict, sections)
+
+
+def _weak_section(found: WeakSpots, opened: Map) -> list[str]:
+    """Where the next drives will hardly be localised; nothing of an empty map."""
+    if found.advice is None:
+        return []
+    about = f"{Path(opened.location).name} from above, by the share that drives will probably miss"
+    rows = spot_rows(found, opened)
+    caption = f"Weak spots, the weakest first{_more(len(rows))}"
+    table_of_spots = [table(HEAD, rows[:_LISTED], caption)] if rows else []
+    drawn = drawing(as_svg(draw_weakness(found, opened), about), f"{verdict(found)}.")
+    advice = paragraph(f"{advice_text(found.advice, opened)}.")
+    return [heading("Weak spots"), drawn, advice, *table_of_spots]
 
 
 def examined_page(
