@@ -39,6 +39,7 @@ evaluate result.json --truth truth.tum
 report town.engram
 weak-spots town.engram
 weak-spots town.engram
+weak-spots town.engram
 info town.engram --sessions --nodes
 check town.engram
 check town.engram --seal
