@@ -45,6 +45,7 @@ ROUTES = {
     "put /v1/maps/{name}/refs/{ref}": OPERATORS,
     "delete /v1/maps/{name}/refs/{ref}": OPERATORS,
     "get /v1/maps/{name}/diff": PEOPLE,
+    "get /v1/maps/{name}/weak-spots": PEOPLE,
     "get /v1/maps/{name}/blame/{node}": PEOPLE,
     "get /v1/maps/{name}/events": PEOPLE,
     "get /v1/maps/{name}/audit": frozenset({"admin"}),

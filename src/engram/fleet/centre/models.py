@@ -180,6 +180,20 @@ class Difference(Open):
     ]
 
 
+class WeakSpots(Open):
+    """Weak spots and the drive that would mend most, as ``engram weak-spots --json`` has them."""
+
+    missed: Annotated[float, Field(examples=[0.031])]
+    spots: Annotated[
+        list[dict[str, Any]],
+        Field(examples=[[{"from_m": 120.0, "to_m": 340.0, "hours": [21, 23], "missed": 0.34}]]),
+    ]
+    advice: Annotated[
+        dict[str, Any] | None,
+        Field(examples=[{"from_m": 120.0, "to_m": 340.0, "hours": [21, 23], "mends": 0.62}]),
+    ]
+
+
 class Blame(Open):
     """Where a node comes from, as ``engram show NODE --json`` has it."""
 

@@ -25,6 +25,7 @@ from engram.fleet.centre.tables import MapListed, Ref
 from engram.fleet.centre.tables import maps as map_table
 from engram.maps.history import blame_node, map_log
 from engram.maps.map import Map
+from engram.weak_spots import find_weak_spots
 
 maps_router = APIRouter(tags=["maps"])
 READERS = [takes(Role.VIEWER, Role.ROBOT)]
@@ -70,6 +71,13 @@ def diff(
     """What changed between two revisions."""
     with centre.reading(name) as store:
         return store.diff(before, after).to_dict()
+
+
+@maps_router.get("/maps/{name}/weak-spots", response_model=models.WeakSpots, dependencies=PEOPLE)
+def weak_spots(name: str, centre: CentreHere) -> dict[str, Any]:
+    """Where and at which hours the next drives will probably not be localised."""
+    with centre.reading(name) as store:
+        return store.derived(find_weak_spots).to_dict()
 
 
 @maps_router.get("/maps/{name}/blame/{node}", response_model=models.Blame, dependencies=PEOPLE)
