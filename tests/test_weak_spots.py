@@ -132,7 +132,7 @@ def test_a_drive_through_it_at_that_hour_is_proposed(street: Path) -> None:
     assert advice.hours[0] <= 22 < advice.hours[1]
     assert advice.from_m <= 40.5
     assert advice.to_m >= 59.5
-    assert 0 < advice.mends < 1
+    assert 0.5 < advice.mends < 1
 
 
 def test_only_the_hours_of_the_fleet_count(street: Path) -> None:

@@ -399,6 +399,20 @@ class History:
     def __len__(self) -> int:
         return len(self.hour)
 
+    def and_mapped(self, hour: float) -> History:
+        """This history, and a drive of the newest one's day that maps all places at an hour."""
+        newest = int(np.argmax(self.order))
+        nothing, places = np.zeros((1, self.seen.shape[1])), self.seen.shape[1]
+        return History(
+            np.append(self.hour, hour),
+            np.append(self.day, self.day[newest]),
+            np.append(self.order, self.order[newest] + 1),
+            np.vstack([self.seen, nothing + 1]),
+            np.vstack([self.missed, nothing]),
+            np.vstack([self.weak, nothing]),
+            np.vstack([self.saved, np.ones((1, places), np.bool_)]),
+        )
+
 
 # Between these hours, solar time, it is night wherever the sun sets at all.
 _NIGHT_TO_H, _NIGHT_FROM_H = 3.0, 21.0
@@ -653,7 +667,7 @@ def find_weak_spots(
     chosen = named(weakness, places, config, hours)
     total_m, driven_m = weakness.expected_m.sum(), weakness.demand_m.sum()
     every = len(hours) or HOURS
-    cells, now = _Cells(opened, places, weakness, config), _times(history)[0]
+    cells = _Cells(opened, places, weakness, config)
     return WeakSpots(
         revision=opened.revision,
         drives=len(opened.sessions),
@@ -666,7 +680,7 @@ def find_weak_spots(
             places.length_m @ chosen.sum(axis=1) / max(places.length_m.sum() * every, 1e-9)
         ),
         spots=sorted(cells.spots(chosen), key=lambda one: -one.expected),
-        advice=cells.advice(now.alike(now, config)),
+        advice=cells.advice(history),
         places=places,
         weakness=weakness,
     )
@@ -739,18 +753,15 @@ class _Cells:
             why,
         )
 
-    def advice(self, alike: Array) -> Advice | None:
-        """The hours and the stretch in which one more drive would mend most.
-
-        Args:
-            alike: (24, 24) how like the light of each hour is to that of each other.
-        """
-        if not len(self.places):
+    def advice(self, history: History) -> Advice | None:
+        """The hours and the stretch in which one more drive, mapped, would mend most."""
+        if not len(self.places) or not len(history):
             return None
         expected_m = self.weakness.expected_m
-        counts = self.config.prior_drives + self.weakness.like
-        pooled = self.places.pooling(self.config.pool_m).sum(axis=0)[:, None]
-        mended_m = [expected_m * (more := pooled * row) / (counts + more) for row in alike]
+        mended_m = []
+        for hour in range(HOURS):
+            after = weakness_of(self.places, history.and_mapped(hour + 0.5), self.config)
+            mended_m.append((self.weakness.rate - after.rate) * self.weakness.demand_m)
         by_hour = np.array([one.sum() for one in mended_m])
         best = int(np.argmax(by_hour))
         session, first, last = self._stretch(mended_m[best].sum(axis=1))

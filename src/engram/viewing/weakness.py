@@ -35,6 +35,8 @@ _CLASSES = (
     (1.0, "above 10 %", LOST),
 )
 HEAD = ("metres", "along", "hours", "missed", "of all missed", "like drives", "why")
+# Spots that people read.
+_LISTED = 12
 _WIDTHS = (9, 30, 7, 7, 14, 12, 0)
 
 
@@ -92,7 +94,9 @@ def verdict(found: WeakSpots) -> str:
 def weak_spots_text(found: WeakSpots, opened: Map) -> str:
     """A table for people, and what to drive next."""
     rows = spot_rows(found, opened)
-    lines = [_line(row) for row in ([HEAD, *rows] if rows else [])]
+    lines = [_line(row) for row in ([HEAD, *rows[:_LISTED]] if rows else [])]
+    if len(rows) > _LISTED:
+        lines.append(f"and {len(rows) - _LISTED} with less missed: --json lists all")
     lines.append(verdict(found))
     if found.unknown_hours:
         lines.append(
