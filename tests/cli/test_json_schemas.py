@@ -38,8 +38,6 @@ record STREET c.framelog --frames 2::3 --recorded-at 2026-03-02T12:00:00Z
 evaluate result.json --truth truth.tum
 report town.engram
 weak-spots town.engram
-weak-spots town.engram
-weak-spots town.engram
 info town.engram --sessions --nodes
 check town.engram
 check town.engram --seal
