@@ -14,8 +14,9 @@ from tests.builders import forward, synthetic_drive, write_street
 from engram.errors import ConfigError
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
-from engram_lab.studies import peers
+from engram_lab.studies import pages, peers
 from engram_lab.studies.peers import Answer, Engram, Scene, Sift, TrueDrive, judged, rows_of
+from engram_lab.studies.plan import write_csv
 from engram_lab.studies.sift_places import (
     Corners,
     SiftMap,
@@ -189,3 +190,23 @@ def test_results_of_another_version_are_refused(tmp_path: Path) -> None:
     peers._check_version(tmp_path / "configuration.json", 1)
     with pytest.raises(ConfigError, match=r"seed 1, this run is of .* seed 2; give another --out"):
         peers._check_version(tmp_path / "configuration.json", 2)
+
+
+def test_pages_draw_the_town_and_the_clips(tmp_path: Path) -> None:
+    figures = judged([answer(0.0, 0.01), answer(5.0), answer(20.0, 2.0)])
+    rows = [
+        {"system": "A", "scene": scene, "drive": drive, "map_mb": 3.2, **figures}
+        for scene, drive in (
+            ("village", "fair"), ("village", "snow"), ("village, two drives", "fair"),
+            ("KITTI 06", "odd"), ("EuRoC V1_01", "late"),
+        )
+    ]  # fmt: skip
+    (tmp_path / "peers").mkdir()
+    write_csv(tmp_path / "peers/peers.csv", rows)
+    head, _, of_five, of_two = pages.peers(tmp_path)
+    assert head.startswith("| localised, % | mapped | fair | snow | false")
+    assert of_five == "| A | 5 | 67 | 67 | 2 of 4 | 100 | 100.5 | 2 | 3 |"
+    assert of_two == "| A | 2 | 67 | 1 of 2 | 100 | 100.5 | 2 | 3 |"
+    head, _, of_clips = pages.peers_on_clips(tmp_path)
+    assert head.startswith("| | KITTI 06 | false | error, cm | CPU, ms | MB | EuRoC V1_01 | ")
+    assert of_clips == "| A | 2 of 3 | 1 | 100.5 | 2 | 3.2 | 2 of 3 | 1 | 100.5 | 2 | 3.2 |"

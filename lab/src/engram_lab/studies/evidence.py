@@ -249,6 +249,14 @@ STUDIES: Mapping[str, Study] = {
         ("docs/eyes.md", "lab/reports/eyes.md"),
         real=True,
     ),
+    "peers": Study(
+        (f"{_EVALUATE}peers --out {{out}}",),
+        20,
+        ("peers.csv", "configuration.json"),
+        ("docs/compare.md",),
+        real=True,
+        resumes=True,
+    ),
     "confidence": Study(
         ("python -m engram_lab.fits.confidence --shipped --held-out 405,406,407",),
         60,

@@ -241,6 +241,75 @@ def fleet(tables: Path) -> Iterator[str]:
         yield f"| {what} | {paper} | {' | '.join(cells)} |"
 
 
+def _peers_of(tables: Path, *scenes: str) -> dict[tuple[str, str], list[Row]]:
+    """The rows of some scenes by scene and system, in the order of the table."""
+    found: dict[tuple[str, str], list[Row]] = {}
+    for row in read(tables / "peers/peers.csv"):
+        if row["scene"] in scenes:
+            # The page says once what the pipeline consists of.
+            system = row["system"].replace(", VLAD and PnP", "")
+            found.setdefault((row["scene"], system), []).append(row)
+    return found
+
+
+def _range(rows: Iterable[Row], name: str, digits: int) -> str:
+    """The least and the greatest of a column's numbers, as they are shown."""
+    known = sorted(float(row[name]) for row in rows if row[name])
+    ends = dict.fromkeys(f"{one:.{digits}f}" for one in (known[0], known[-1]))
+    return "–".join(ends)
+
+
+# Scenes of the town, and how many drives their maps hold.
+_OF_TOWN = {"village": "5", "village, two drives": "2"}
+
+
+def peers(tables: Path) -> Iterator[str]:
+    """The town: what each system localises of each drive, and what it costs."""
+    found = _peers_of(tables, *_OF_TOWN)
+    drives = [row["drive"] for row in next(iter(found.values()))]
+    yield (
+        f"| localised, % | mapped | {' | '.join(drives)} | false | gaps, % | error, cm "
+        "| CPU, ms | MB |"
+    )
+    yield f"| --- |{' --- |' * (len(drives) + 6)}"
+    for (scene, system), rows in found.items():
+        shares = (f"{100 * int(row['localised']) / int(row['frames']):.0f}" for row in rows)
+        false, fixes = (sum(int(row[name]) for row in rows) for name in ("false", "localised"))
+        cells = [
+            _OF_TOWN[scene],
+            *shares,
+            f"{false} of {fixes}",
+            f"{max(100 * float(row['gap_share']) for row in rows):.0f}",
+            _range(rows, "median_cm", 1),
+            _range(rows, "cpu_ms", 0),
+            f"{float(rows[0]['map_mb']):.0f}",
+        ]
+        yield f"| {system} | {' | '.join(cells)} |"
+
+
+_CLIPS = ("KITTI 06", "EuRoC V1_01")
+
+
+def peers_on_clips(tables: Path) -> Iterator[str]:
+    """The same on the real clips."""
+    found = _peers_of(tables, *_CLIPS)
+    heads = (f"{clip} | false | error, cm | CPU, ms | MB" for clip in _CLIPS)
+    yield f"| | {' | '.join(heads)} |"
+    yield f"| --- |{' --- |' * 5 * len(_CLIPS)}"
+    for system in dict.fromkeys(name for _, name in found):
+        cells = []
+        for clip in _CLIPS:
+            (row,) = found[clip, system]
+            cells += [
+                f"{row['localised']} of {row['frames']}",
+                row["false"],
+                _range([row], "median_cm", 1),
+                _range([row], "cpu_ms", 0),
+                f"{float(row['map_mb']):.1f}",
+            ]
+        yield f"| {system} | {' | '.join(cells)} |"
+
+
 @dataclass(frozen=True, slots=True)
 class Block:
     """A part of a page: its study, and what draws it from the kept tables."""
@@ -257,6 +326,8 @@ BLOCKS: Mapping[str, Block] = {
     "ranking": Block("ranking", ranking),
     "budgets": Block("budgets", lambda tables: in_short(tables / "budgets/cells.csv")),
     "fleet": Block("fleet", fleet),
+    "peers": Block("peers", peers),
+    "peers-on-clips": Block("peers", peers_on_clips),
 }
 
 
