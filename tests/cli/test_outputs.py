@@ -16,6 +16,7 @@ FILES = {
     ("live", "--view"): "v.rrd",
     ("record", "LOG"): "d.framelog",
     ("plot", "FILE"): "p.png",
+    ("weak-spots", "--out"): "w.png",
     ("view", "--view"): "v.rrd",
     ("export", "FILE"): "e.csv",
     ("diff", "--picture"): "p.png",

@@ -157,6 +157,7 @@ MAP_VERBS = [
     "log MAP --oneline",
     "merge fleet.engram MAP",
     "plot MAP out.png --by robot",
+    "weak-spots MAP",
     "report MAP --out out.html",
     "revert MAP 1 --dry-run",
     "show MAP",
@@ -189,7 +190,7 @@ DRIVE_VERBS = [
 OWN = {
     "settings", "features", "try", "demo", "lab bench", "lab fleet-day", "lab simulate",
     "lab evaluate all", "lab evaluate budgets", "lab evaluate faults", "lab evaluate fleet",
-    "lab evaluate public", "lab evaluate ranking", "lab evaluate scale",
+    "lab evaluate peers", "lab evaluate public", "lab evaluate ranking", "lab evaluate scale",
 }  # fmt: skip
 
 

@@ -26,7 +26,7 @@ from engram.ranking.policies import check_for_robot
 # Settings files that ship with the package: the rules of one paper each.
 PAPERS = ("linegar2015", "gadd2016")
 # Tables of a settings file that only the verbs of the command line read.
-VERB_TABLES = frozenset({"drive", "merge", "build", "download", "repair", "islands"})
+VERB_TABLES = frozenset({"drive", "merge", "build", "download", "repair", "islands", "weak_spots"})
 
 
 @dataclass(frozen=True, slots=True)
