@@ -79,6 +79,16 @@ _FIRST_40 = ",".join(map(str, range(40)))
 _LAPS = ("3", "13", "23", "33")
 _TOWN_2 = f"{{campaigns}}/begbroke24h-standard-seed2-v{WORLD_VERSION}"
 
+
+def _conditions(kind: str) -> tuple[str, ...]:
+    """In maps of both lights, of the morning, and of the night."""
+    return tuple(
+        "python -m engram_lab.studies.conditions --maps {out}/maps --towns 507,508 "
+        f"--kind {kind} --mapped {mapped} --csv {{out}}/conditions.csv"
+        for mapped in ("0,2", "0", "2")
+    )
+
+
 # In the order in which they are worth their time.
 STUDIES: Mapping[str, Study] = {
     "real-images": Study(
@@ -91,9 +101,9 @@ STUDIES: Mapping[str, Study] = {
     ),
     "robot-needs": Study(
         (f"{_CHECKS}robot_needs --json {{out}}/figures.json",),
-        5,
+        8,
         ("figures.json",),
-        ("README.md",),
+        ("README.md", "docs/eyes.md"),
         real=True,
         town=False,
     ),
@@ -106,15 +116,13 @@ STUDIES: Mapping[str, Study] = {
     ),
     # Towns that no setting and no constant was chosen on.
     "conditions": Study(
-        tuple(
-            "python -m engram_lab.studies.conditions --maps {out}/maps --towns 507,508 "
-            f"--kind {kind} --mapped {mapped} --csv {{out}}/conditions.csv"
-            for kind in ("brief", "net")
-            for mapped in ("0,2", "0", "2")
-        ),
-        60,
+        _conditions("brief"),
+        25,
         ("conditions.csv",),
         ("docs/evidence.md", "lab/reports/conditions.md"),
+    ),
+    "conditions-net": Study(
+        _conditions("net"), 30, ("conditions.csv",), ("lab/reports/conditions.md",)
     ),
     # Fifteen days and nights; the papers' own sizes are in "ranking-elsewhere".
     "ranking": Study(
@@ -125,7 +133,7 @@ STUDIES: Mapping[str, Study] = {
         ),
         70,
         _STUDIED,
-        ("docs/papers.md", "lab/reports/ranking.md"),
+        ("lab/reports/ranking.md",),
         campaigns=("begbroke24h",),
         resumes=True,
     ),
@@ -153,6 +161,17 @@ STUDIES: Mapping[str, Study] = {
         _STUDIED,
         ("lab/reports/ranking.md",),
         campaigns=("begbroke24h", "keble", "oxford"),
+        resumes=True,
+    ),
+    "year": Study(
+        (
+            "engram lab simulate year",
+            "python -m engram_lab.studies.year --out {out}",
+        ),
+        60,
+        ("drives.csv", "year.md"),
+        ("docs/papers.md",),
+        campaigns=("year",),
         resumes=True,
     ),
     "budgets": Study(
@@ -208,7 +227,7 @@ STUDIES: Mapping[str, Study] = {
         (f"{_EVALUATE}faults --only saving --towns 405,406,407,408 --json",),
         60,
         ("1.txt",),
-        ("docs/evidence.md", "lab/reports/constants.md"),
+        ("lab/reports/constants.md",),
     ),
     "cameras": Study(
         (
@@ -217,7 +236,7 @@ STUDIES: Mapping[str, Study] = {
         ),
         30,
         ("1.txt", "2.txt"),
-        ("docs/evidence.md", "lab/reports/fleet-checks.md"),
+        ("lab/reports/fleet-checks.md",),
     ),
     "directions": Study(
         (
@@ -227,14 +246,14 @@ STUDIES: Mapping[str, Study] = {
         ),
         60,
         ("1.txt", "3.txt"),
-        ("docs/evidence.md", "lab/reports/fleet-checks.md"),
+        ("lab/reports/fleet-checks.md",),
         campaigns=("oxford",),
     ),
     "dreams": Study(
         (f"{_EVALUATE}faults --only dreams --towns 405 --json",),
         60,
         ("1.txt",),
-        ("docs/evidence.md", "lab/reports/fleet-checks.md"),
+        ("lab/reports/fleet-checks.md",),
     ),
     "lookalikes": Study(
         (f"{_EVALUATE}faults --only equal-fronts --live 3 --json",),
@@ -306,6 +325,18 @@ STUDIES: Mapping[str, Study] = {
         ("2000.json", "20000.json"),
         ("docs/centre.md",),
         town=False,
+    ),
+    "weak-spots": Study(
+        (
+            f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
+            "python -m engram_lab.studies.weak_spots begbroke24h --drives 32 --mapped 1 --from 24 "
+            "--maps {out}/maps --json {out}/figures.json",
+        ),
+        20,
+        ("figures.json", "2.txt"),
+        ("lab/reports/weak-spots.md",),
+        campaigns=("begbroke24h",),
+        resumes=True,
     ),
     "kills": Study(
         (f"{_CHECKS}kill_mapping {{data}}/kitti_odometry/sequences/06 --kills 50",),

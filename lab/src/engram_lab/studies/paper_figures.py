@@ -43,11 +43,12 @@ def read(path: Path) -> list[Row]:
         return list(csv.DictReader(file))
 
 
-def pooled(rows: Sequence[Row], campaign: str = "begbroke") -> list[Row]:
-    """The pooled rows of a campaign at the studies' usual settings."""
-    usual = {"campaign": campaign, "rounds": "1", "T": "10", "radius": "search", "mode": "memo",
-             "paths": "matched+saved", "fold": "all"}  # fmt: skip
-    return [one for one in rows if all(one[name] == value for name, value in usual.items())]
+def pooled(rows: Sequence[Row]) -> list[Row]:
+    """The rows of all folds but those of the path policies' variants."""
+    usual = {"rounds": "1", "T": "10", "radius": "search", "mode": "memo", "fold": "all"}
+    some = [one for one in rows if all(one[name] == value for name, value in usual.items())]
+    paths = some[0]["paths"] if some else ""  # the settings' own: the first configuration is plain
+    return [one for one in some if one["paths"] == paths]
 
 
 def missed(rows: Sequence[Row]) -> Interval:
@@ -99,7 +100,7 @@ def lanes(rows: Sequence[Row]) -> Figure:
     for place, (policy, label) in enumerate(LANES.items()):
         own = [one for one in usual if one["policy"] == policy]
         curve(axes, own, "lanes", "share_not_localised", label, place=place)
-    _doubling(axes, (1, 2, 4, 8, 16))
+    _doubling(axes, (1, 2, 4, 8))
     return _ended(figure, axes, logarithmic=True)
 
 
@@ -107,11 +108,11 @@ def growth(rows: Sequence[Row]) -> Figure:
     """P(> 10 m) as the map grows, two lanes ([L15] Fig. 9)."""
     figure, axes = _axes("drives in the map", "P(> 10 m), %")
     usual = [one for one in pooled(rows) if one["map_sessions"] and one["lanes"] == "2"]
-    steps = {"1", "2", "4", "8", "16", "20", "24", "31"}
+    steps = {"1", "2", "4", "8", "16", "24"}
     for place, (policy, label) in enumerate(GROWTH.items()):
         own = [one for one in usual if one["policy"] == policy and one["map_sessions"] in steps]
         curve(axes, own, "map_sessions", "p_gt_10m", label, place=place)
-    _doubling(axes, (1, 2, 4, 8, 16, 31))
+    _doubling(axes, (1, 2, 4, 8, 16, 24))
     return _ended(figure, axes, logarithmic=True)
 
 
@@ -163,12 +164,15 @@ def _ended(figure: Figure, axes: Axes, *, logarithmic: bool) -> Figure:
 
 
 def pictures(tables: Path) -> dict[str, tuple[Path, Figure]]:
-    """Each picture by name, with the table that it is drawn from."""
-    ranking, fleet = tables / "ranking/summary.csv", tables / "fleet/sessions.csv"
+    """Each picture by name, with the table that it is drawn from; none of what was not measured."""
+    # With a front-end as weak as the papers'; with today's nothing fails that a curve could show.
+    starved, fleet = tables / "starved/summary.csv", tables / "fleet/sessions.csv"
     drawn = {
-        "papers_lanes": (ranking, lanes),
-        "papers_growth": (ranking, growth),
+        "papers_lanes": (starved, lanes),
+        "papers_growth": (starved, growth),
         "papers_merge": (fleet, merging),
         "papers_downloads": (fleet, downloads),
     }
-    return {name: (table, draw(read(table))) for name, (table, draw) in drawn.items()}
+    return {
+        name: (table, draw(read(table))) for name, (table, draw) in drawn.items() if table.exists()
+    }

@@ -159,6 +159,7 @@ def quarters(rows: Sequence[Row]) -> Iterator[Row]:
     """What each arm came to, by quarters of the year."""
     for arm in dict.fromkeys(row["arm"] for row in rows):
         own = [row for row in rows if row["arm"] == arm]
+        forgets = any(row["forgotten"] for row in own)
         for quarter in range(4):
             some = own[_SETTLED * quarter : _SETTLED * (quarter + 1)]
             if not some:
@@ -170,7 +171,7 @@ def quarters(rows: Sequence[Row]) -> Iterator[Row]:
                 "nodes saved a km": sum(row["saved"] for row in some) / driven_m * 1e3,
                 "nodes": some[-1]["nodes"],
                 # What is forgotten stays in the file until it is erased.
-                "MB": None if some[-1]["forgotten"] else some[-1]["size_bytes"] / 1e6,
+                "MB": None if forgets else some[-1]["size_bytes"] / 1e6,
                 "route not localised, %": 100
                 * sum(row["share_not_localised"] * row["driven_m"] for row in some)
                 / driven_m,
