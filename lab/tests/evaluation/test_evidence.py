@@ -205,7 +205,8 @@ def test_a_page_shows_the_studies_that_name_it_drawn_or_by_hand() -> None:
         for page in study.pages:
             if not page.startswith("lab/"):
                 wanted.setdefault(page, set()).add(name)
-    assert shown == wanted
+    # Reports also have figures of studies that they need not draw.
+    assert {page: some for page, some in shown.items() if not page.startswith("lab/")} == wanted
 
 
 def test_every_block_is_in_a_page() -> None:
