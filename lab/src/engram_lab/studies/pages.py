@@ -29,6 +29,7 @@ from engram_lab.intervals import Interval, Resamples, SessionSums, difference
 from engram_lab.studies.budgets import in_short
 from engram_lab.studies.evidence import MANIFEST, STUDIES, State, read_manifest
 from engram_lab.studies.paper_figures import Row, pictures, pooled, read, sessions_of
+from engram_lab.studies.year import quarters
 
 # Below the root of a checkout.
 TABLES, PICTURES = "lab/reports/tables", "docs/pictures"
@@ -248,7 +249,20 @@ def kinds(tables: Path) -> Iterator[str]:
 
 def year(tables: Path) -> Iterator[str]:
     """A year in one map, by quarters, and in maps that forget."""
-    yield from (tables / "year/year.md").read_text(encoding="utf-8").strip().splitlines()
+    names = ("driven_m", "far_m", "share_not_localised", "saved", "forgotten", "nodes",
+             "size_bytes", "attempts_per_frame")  # fmt: skip
+    rows = [
+        {"arm": row["arm"], **{name: float(row[name]) for name in names}}
+        for row in read(tables / "year/drives.csv")
+    ]
+    found = list(quarters(rows))
+    yield "| by quarters | nodes saved a km | route missed, % | nodes at last |"
+    yield "| --- | --- | --- | --- |"
+    for arm in dict.fromkeys(row["arm"] for row in found):
+        own = [row for row in found if row["arm"] == arm]
+        saved = ", ".join(f"{row['nodes saved a km']:.0f}" for row in own)
+        missed = ", ".join(f"{row['route not localised, %']:.1f}" for row in own)
+        yield f"| {arm} | {saved} | {missed} | {own[-1]['nodes']:.0f} |"
 
 
 def _sums(rows: Sequence[Row], drives: Iterable[tuple[str, str]]) -> SessionSums:
