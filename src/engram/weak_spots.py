@@ -193,7 +193,7 @@ class _Finder:
     _squares: dict[tuple[int, ...], list[tuple[int, int]]] = field(default_factory=dict)
 
     def place(self, node: int) -> int:
-        """The place of a node, a new one if there is none near it."""
+        """The place of a node; a new one where no place is near."""
         square = tuple((self.points_m[node] // self.config.reach_m).astype(int).tolist())
         known = self._near(node, square)
         if known is not None:

@@ -72,7 +72,7 @@ def test_growth_and_quarters_are_of_the_rows() -> None:
         for week in range(26)
     ]  # fmt: skip
     first, second = quarters(rows)
-    assert first["weeks"], second["weeks"] == ("1 to 13", "14 to 26")
+    assert (first["weeks"], second["weeks"]) == ("1 to 13", "14 to 26")
     assert first["nodes saved a km"] == pytest.approx(100)
     assert (first["nodes"], second["nodes"]) == (100, 200)
     assert second["P(> 10 m), %"] == pytest.approx(1)

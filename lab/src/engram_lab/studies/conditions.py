@@ -31,15 +31,15 @@ from engram.config import config_hash
 from engram.frontend.frontend import FrontendConfig
 from engram.geometry.se3 import SE3
 from engram.maps.map import open_map
-from engram.monitor import write_whole
 from engram.robot.settings import RobotOptions, Settings
 from engram_lab.accuracy import Count
 from engram_lab.programs import command_line, numbers
 from engram_lab.studies.building import build_map
 from engram_lab.studies.drives import EvaluatedDrive
+from engram_lab.studies.plan import write_csv
 from engram_lab.studies.streets import Kind, Street, Try, drives_in
 from engram_lab.town.camera_model import CLEAN, Lens
-from engram_lab.town.campaigns import Campaign, SessionPlan, campaign_named
+from engram_lab.town.campaigns import Campaign, small_loop
 from engram_lab.town.glass import Glass
 
 _FIRST_DAY = datetime(2025, 7, 14, tzinfo=UTC)
@@ -66,21 +66,11 @@ _MISPLACED = (1, 4, 5, 7)
 
 def small_town(seed: int) -> Campaign:
     """One loop of 200 m with a drive in each condition."""
-    hamlet = campaign_named("hamlet", seed)
-    first = hamlet.sessions[0].seed
-    sessions = tuple(
-        SessionPlan(
-            number,
-            _FIRST_DAY + timedelta(days=day, hours=hour),
-            weather,
-            "wildcat",
-            False,
-            first + 7919 * number,
-            lens,
-        )
-        for number, (_, day, hour, weather, lens) in enumerate(_DRIVES)
-    )
-    return replace(hamlet, name="small", home="small", length_m=_LOOP_M, sessions=sessions)
+    drives = [
+        (_FIRST_DAY + timedelta(days=day, hours=hour), weather, lens)
+        for _, day, hour, weather, lens in _DRIVES
+    ]
+    return small_loop("small", seed, _LOOP_M, drives)
 
 
 @dataclass(frozen=True, slots=True)
@@ -272,11 +262,7 @@ def add_rows(
     if path.exists():
         with path.open(encoding="utf-8", newline="") as file:
             kept = [one for one in csv.DictReader(file) if not about.items() <= one.items()]
-    table = [*kept, *({**about, **asdict(row), **size} for row in rows)]
-    with write_whole(path) as draft, draft.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, list(table[0]))
-        writer.writeheader()
-        writer.writerows(table)
+    write_csv(path, [*kept, *({**about, **asdict(row), **size} for row in rows)])
 
 
 def main() -> None:

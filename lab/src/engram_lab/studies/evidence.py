@@ -169,7 +169,7 @@ STUDIES: Mapping[str, Study] = {
             "python -m engram_lab.studies.year --out {out}",
         ),
         60,
-        ("drives.csv", "year.md"),
+        ("drives.csv",),
         ("docs/papers.md",),
         campaigns=("year",),
         resumes=True,

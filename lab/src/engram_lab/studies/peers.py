@@ -19,7 +19,7 @@ import csv
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from importlib.util import find_spec
@@ -42,7 +42,8 @@ from engram_lab.accuracy import is_false
 from engram_lab.studies.building import write_json
 from engram_lab.studies.plan import Row, alone_in, make_folder, plain_table, write_csv
 from engram_lab.studies.sift_places import SiftMap
-from engram_lab.town.campaigns import WORLD_VERSION, Campaign, SessionPlan, campaign_named
+from engram_lab.town.camera_model import CLEAN
+from engram_lab.town.campaigns import WORLD_VERSION, Campaign, small_loop
 from engram_lab.town.session import SimulatedSequence
 from engram_lab.town.simulating import campaign_folder, simulate
 from engram_lab.truth import read_matrix_truth
@@ -72,20 +73,11 @@ GAP_M = 10.0
 
 def small_village(seed: int = SEED) -> Campaign:
     """One loop with ten drives of one robot."""
-    hamlet = campaign_named("hamlet", seed)
-    first = hamlet.sessions[0].seed
-    sessions = tuple(
-        SessionPlan(
-            number,
-            _FIRST_DAY + timedelta(days=day, hours=hour),
-            weather,
-            "wildcat",
-            False,
-            first + 7919 * number,
-        )
-        for number, (_, day, hour, weather) in enumerate(_DRIVES)
-    )
-    return replace(hamlet, name="peers", home="peers", length_m=_LOOP_M, sessions=sessions)
+    drives = [
+        (_FIRST_DAY + timedelta(days=day, hours=hour), weather, CLEAN)
+        for _, day, hour, weather in _DRIVES
+    ]
+    return small_loop("peers", seed, _LOOP_M, drives)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -293,7 +285,7 @@ def judged(answers: Sequence[Answer], least_inliers: int = 0) -> Row:
     """The figures of a drive.
 
     Args:
-        least_inliers: a pose with fewer is none.
+        least_inliers: a pose with fewer does not count as a fix.
     """
     fixes = [one for one in answers if one.error_m is not None and one.inliers >= least_inliers]
     errors_m = [float(one.error_m or 0.0) for one in fixes]

@@ -152,7 +152,7 @@ def absolute_pose(
     """``world_from_cam`` of a left camera that sees (N, 3) world points at (N, 2) pixels.
 
     Returns:
-        The pose and its number of inliers; None where there is none.
+        The pose and its number of inliers; None where none is found.
 
     Raises:
         MissingExtraError: pycolmap is not installed.
@@ -226,7 +226,7 @@ class SiftMap:
         return np.stack([one.place for one in self._images])
 
     def localise(self, pair: StereoPair) -> tuple[SE3, int] | None:
-        """``world_from_cam`` of a pair's left image, and the inliers; None where there is none."""
+        """``world_from_cam`` of a pair's left image, and the inliers; None where none is found."""
         live = root_sift(pair.left, self._options)
         if not len(live.pixels):
             return None

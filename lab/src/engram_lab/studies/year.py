@@ -13,7 +13,6 @@ run continues where the first one stopped.
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,14 +26,13 @@ from engram.graph.model import NodeId
 from engram.maps.forgetting import Chosen
 from engram.maps.map import Map
 from engram.measures import Drive, failure_sums, route_not_localised
-from engram.monitor import write_whole
 from engram.robot.mapping import MapReport
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import measured
 from engram_lab.programs import command_line
 from engram_lab.studies.building import build_map, write_json
 from engram_lab.studies.drives import EvaluatedDrive, open_campaign
-from engram_lab.studies.plan import Row, table
+from engram_lab.studies.plan import Row, table, write_csv
 from engram_lab.town.simulating import campaigns_folder
 
 # Share of the whole map's last number of nodes that a map which forgets may hold.
@@ -105,7 +103,7 @@ class Year:
         """
         path = self.folder / f"{arm.replace(' ', '-')}.engram"
         kept = path.with_suffix(".rows.json")
-        found: list[Row] = json.loads(kept.read_text()) if kept.exists() else []
+        found: list[Row] = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else []
         for number in range(len(found), len(self.drives)):
             built = build_map(
                 path,
@@ -146,13 +144,6 @@ def _row(arm: str, drive: EvaluatedDrive, report: MapReport) -> Row:
 
 def _missed(drive: Drive) -> float:
     return float(route_not_localised([drive]))
-
-
-def _write_csv(path: Path, rows: Sequence[Row]) -> None:
-    with write_whole(path) as draft, draft.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def quarters(rows: Sequence[Row]) -> Iterator[Row]:
@@ -204,7 +195,7 @@ def main() -> None:
     for arm in others:
         if arm in asked.arms.split(","):
             found += year.rows(arm, most)
-    _write_csv(asked.out / "drives.csv", found)
+    write_csv(asked.out / "drives.csv", found)
     whole = [row for row in found if row["arm"] == first]
     lines = [
         f"{len(whole)} drives of `{asked.campaign}`. Nodes grow by {growth_a_month(whole):.1f} % a "

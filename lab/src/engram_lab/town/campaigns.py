@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from enum import StrEnum
@@ -410,6 +410,19 @@ def estate(seed: int, size: Size = Size.STANDARD, fronts: Fronts | None = None) 
     length_m = 6 * fronts.spacing_m
     name = f"estate-{fronts.name}"
     return Campaign(name, seed, length_m, False, sessions, 0.2, size, name, fronts=fronts)
+
+
+def small_loop(
+    name: str, seed: int, length_m: float, drives: Sequence[tuple[datetime, str, Lens]]
+) -> Campaign:
+    """A hamlet's loop with drives of one robot: start, weather and lens each, in order of time."""
+    hamlet = campaign_named("hamlet", seed)
+    first = hamlet.sessions[0].seed
+    sessions = tuple(
+        SessionPlan(number, start, weather, "wildcat", False, first + 7919 * number, lens)
+        for number, (start, weather, lens) in enumerate(drives)
+    )
+    return replace(hamlet, name=name, home=name, length_m=length_m, sessions=sessions)
 
 
 CAMPAIGNS: dict[str, Callable[[int, Size], Campaign]] = {

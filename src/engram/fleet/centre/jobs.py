@@ -51,8 +51,8 @@ def named(centre: Centre, kind: type[Job], beginning: str) -> Job:
     """A job by its id, or enough of its beginning.
 
     Raises:
-        UnknownError: there is none.
-        InputError: several begin so.
+        UnknownError: no job has such an id.
+        InputError: several jobs do.
     """
     begins = TABLES[kind].c.id.startswith(beginning, autoescape=True)
     found = centre.database.rows(kind, begins)
