@@ -390,3 +390,19 @@ def test_what_a_withdrawn_fix_would_have_omitted_is_taken(fleet, tmp_path, monke
         assert not set(seen[2:]) & stamps
         assert report.taken == 2
     assert_sound(centre)
+
+
+def test_fixes_on_trial_at_the_end_of_a_segment_neither_omit_nor_join(fleet, tmp_path, monkeypatch):
+    centre = Path(shutil.copy(fleet["first"][0], tmp_path / "centre.engram"))
+    with Map.open(centre) as store:
+        before = store.node_count()
+    monkeypatch.setattr(Localiser, "on_trial", property(lambda _: True))
+    (report,) = merged(centre, fleet["same"][0])
+    assert report.omitted == 0
+    assert report.components == 2
+    with open_map(centre, None) as opened:
+        assert len(opened.graph) == before + report.taken
+        apart = opened.graph.components()
+        assert apart[:before].max() == 0
+        assert set(apart[before:].tolist()) == {1}
+    assert_sound(centre)

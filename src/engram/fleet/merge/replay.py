@@ -312,6 +312,7 @@ class Replay(ResultSink):
             for stored, logged in self._stream(segment):
                 self._stored = stored
                 robot.step(logged)
+            self._drop_unproved()
             self._release()
             self._end_run()
             self._iterations[session.id] = self._localiser.iteration + _ITERATION_GAP
@@ -492,6 +493,16 @@ class Replay(ResultSink):
         )
 
     # -- the outcome of a frame
+
+    def _drop_unproved(self) -> None:
+        """Withdraws fixes that are still on trial at the end of the segment, as mapping does.
+
+        They agreed over too short a distance: an alike street would do that, too.
+        """
+        if not self._localiser.on_trial:
+            return
+        for held in self._held:
+            held.withdrawn(is_the_fix=held.found.localised)
 
     def _release(self) -> None:
         """Omits or takes the nodes that were held back, in the order of time."""
