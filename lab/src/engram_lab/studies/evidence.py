@@ -75,6 +75,7 @@ _POLICIES = "distance,path,recall,oracle"
 _SWEPT = "--lanes 1,2,4,8,0 --rounds 1 --live-folds 0"
 _STUDIED = ("summary.csv", "sessions.csv", "in_force.csv", "configuration.json")
 _FIRST_40 = ",".join(map(str, range(40)))
+_FIRST_25 = ",".join(map(str, range(25)))
 # Of the town in which false joins are planted.
 _LAPS = ("3", "13", "23", "33")
 _TOWN_2 = f"{{campaigns}}/begbroke24h-standard-seed2-v{WORLD_VERSION}"
@@ -124,14 +125,14 @@ STUDIES: Mapping[str, Study] = {
     "conditions-net": Study(
         _conditions("net"), 30, ("conditions.csv",), ("lab/reports/conditions.md",)
     ),
-    # Fifteen days and nights; the papers' own sizes are in "ranking-elsewhere".
+    # The first 25 of eighty drives; the papers' own sizes are in "ranking-elsewhere".
     "ranking": Study(
         (
-            f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
-            f"{_EVALUATE}ranking begbroke24h --first 40 --policies {_POLICIES} {_SWEPT} "
+            f"engram lab simulate begbroke24h --sessions {_FIRST_25}",
+            f"{_EVALUATE}ranking begbroke24h --first 25 --policies {_POLICIES} {_SWEPT} "
             "--only-folds 0 --out {out}",
         ),
-        70,
+        30,
         _STUDIED,
         ("lab/reports/ranking.md",),
         campaigns=("begbroke24h",),
@@ -139,11 +140,11 @@ STUDIES: Mapping[str, Study] = {
     ),
     "starved": Study(
         (
-            f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
-            f"{_EVALUATE}ranking begbroke24h --first 40 --policies {_POLICIES} {_SWEPT} "
+            f"engram lab simulate begbroke24h --sessions {_FIRST_25}",
+            f"{_EVALUATE}ranking begbroke24h --first 25 --policies {_POLICIES} {_SWEPT} "
             "--only-folds 0 --config {settings}/starved.toml --out {out}",
         ),
-        70,
+        40,
         (*_STUDIED, "maps.csv"),
         ("lab/reports/ranking.md",),
         campaigns=("begbroke24h",),
@@ -176,7 +177,7 @@ STUDIES: Mapping[str, Study] = {
     ),
     "budgets": Study(
         (
-            f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
+            f"engram lab simulate begbroke24h --sessions {_FIRST_25}",
             f"{_EVALUATE}budgets begbroke24h --first 25 --only-folds 0 --out {{out}}",
         ),
         60,
@@ -187,11 +188,11 @@ STUDIES: Mapping[str, Study] = {
     ),
     "fleet": Study(
         (
-            f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
-            f"{_EVALUATE}fleet begbroke24h --first 40 --tried 5 --groups 4 --arms A,B "
-            "--experiments 7,9 --only-folds 0,1 --out {out}",
+            f"engram lab simulate begbroke24h --sessions {_FIRST_25}",
+            f"{_EVALUATE}fleet begbroke24h --first 25 --tried 5 --groups 4 --arms A,B "
+            "--experiments 7,9 --only-folds 0 --out {out}",
         ),
-        70,
+        40,
         _STUDIED,
         ("docs/papers.md", "lab/reports/fleet.md", "lab/reports/downloads.md"),
         campaigns=("begbroke24h",),
@@ -199,11 +200,11 @@ STUDIES: Mapping[str, Study] = {
     ),
     "fleet-as-published": Study(
         (
-            f"engram lab simulate begbroke24h --sessions {_FIRST_40}",
-            f"{_EVALUATE}fleet begbroke24h --first 40 --config {{settings}}/starved-fleet.toml "
+            f"engram lab simulate begbroke24h --sessions {_FIRST_25}",
+            f"{_EVALUATE}fleet begbroke24h --first 25 --config {{settings}}/starved-fleet.toml "
             "--tried 5 --groups 4 --experiments 7,9 --only-folds 0 --out {out}",
         ),
-        45,
+        30,
         _STUDIED,
         ("lab/reports/fleet.md",),
         campaigns=("begbroke24h",),
