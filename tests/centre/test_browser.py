@@ -12,6 +12,7 @@ import uvicorn
 from engram.fleet.centre.application import create_app
 from engram.fleet.centre.fleet import ref_of, robots_of
 from engram.maps.map import Map
+from engram.robot.anchors import anchor_map
 
 from .conftest import NAME, drive
 
@@ -90,6 +91,20 @@ def test_the_map_by_keyboard_and_slider(page):
     page.get_by_text("3 nodes", exact=True).wait_for()
     page.select_option("#colour", "robot")
     assert page.inner_text("#legend li") == "r1 (3 nodes)"
+
+
+def test_parts_that_anchors_hold_are_shown_together(page, site, tmp_path):
+    page.get_by_text("How the parts lie to each other is unknown").wait_for()
+    path, anchors = site.centre.map_path(NAME), tmp_path / "anchors.csv"
+    with Map.open(path) as store:
+        nodes = [node.id for node in store.graph.nodes]
+    places = [f"{node},{20 * at},{at}" for at, node in enumerate(nodes)]
+    anchors.write_text("\n".join(["node,x,y", *places]))
+    anchor_map(path, anchors, author="tests")
+    page.reload()
+    page.get_by_text("No drive joins the 2 pieces shown: anchors hold them together.").wait_for()
+    page.get_by_text("6 nodes", exact=True).wait_for()
+    assert page.locator("#parts").is_hidden()
 
 
 def test_a_version_for_a_robot_and_a_revert_with_its_preview(page, site):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+from uuid import UUID
 from xml.etree import ElementTree
 
 import numpy as np
@@ -10,9 +12,19 @@ import pytest
 from tests.builders import write_street
 
 import engram
-from engram.robot.anchors import add_goal
+from engram.robot.anchors import add_goal, anchor_map
 from engram.sample.drives import write_drives
-from engram.viewing.drawings import Panel, Track, _arrows, as_svg, draw_parts, parts_of, plot_map
+from engram.viewing.drawings import (
+    Panel,
+    Track,
+    _arrows,
+    as_svg,
+    draw_parts,
+    map_above,
+    parts_of,
+    plot_map,
+)
+from engram.viewing.report import map_page
 
 HOSTILE = "<script>alert(1)</script> $x$ \x1b[31m -->"
 
@@ -71,6 +83,45 @@ def test_a_goal_is_drawn_in_its_part(two_parts: Path, tmp_path: Path) -> None:
         marks = [panel.marks for panel in parts_of(opened).panels]
     assert list(marks[0]) == []
     assert list(marks[1]) == ["dock"]
+
+
+def anchored(town: Path, folder: Path, of_second: int) -> Path:
+    """A copy of a map of two parts: two anchors hold the first one, so many the second."""
+    copy, lines = folder / "anchored.engram", ["node,x,y"]
+    shutil.copy(town, copy)
+    with engram.open_map(copy) as opened:
+        above = map_above(opened)
+    for part, (across_m, count) in enumerate(((0.0, 2), (40.0, of_second))):
+        nodes = np.flatnonzero(above.part == part)
+        for node, along_m in zip(nodes[[0, -1]][:count], (0.0, 10.0), strict=False):
+            uuid = UUID(bytes=above.placed.uuids[node].tobytes())
+            lines.append(f"{uuid},{along_m},{across_m}")
+    (folder / "anchors.csv").write_text("\n".join(lines))
+    anchor_map(copy, folder / "anchors.csv", author="a")
+    return copy
+
+
+def test_parts_that_anchors_hold_are_drawn_together(two_parts: Path, tmp_path: Path) -> None:
+    with engram.open_map(anchored(two_parts, tmp_path, of_second=2)) as opened:
+        parts = parts_of(opened, title="town")
+    assert [panel.title for panel in parts.panels] == ["town"]
+    assert (parts.above.sizes(), parts.above.pieces()) == ([parts.nodes], [2])
+
+
+def test_one_anchor_gives_no_direction_so_its_part_stays_apart(
+    two_parts: Path, tmp_path: Path
+) -> None:
+    with engram.open_map(anchored(two_parts, tmp_path, of_second=1)) as opened:
+        above = map_above(opened)
+    assert (len(above.sizes()), above.pieces()) == (2, [1, 1])
+
+
+def test_a_page_says_that_anchors_hold_what_no_drive_joins(two_parts: Path, tmp_path: Path) -> None:
+    assert (
+        "2 parts whose places relative to each other are unknown" in map_page(two_parts, []).verdict
+    )
+    together = map_page(anchored(two_parts, tmp_path, of_second=2), []).verdict
+    assert together.endswith("mapped; anchors hold 2 unconnected pieces together.")
 
 
 def test_arrows_point_along_the_line() -> None:

@@ -546,6 +546,29 @@ def replace_after_removal(
     return placing.around(poses, stays) if not stays.all() else poses
 
 
+# Anchors must be this far apart to determine a direction, metres.
+LEAST_APART_M = 5.0
+
+
+def held_by_anchors(component: Indices, positions_m: Array) -> Indices:
+    """Components whose place and direction in the map frame their anchors determine.
+
+    Args:
+        component: (A,) int64, that of each anchored node.
+        positions_m: (A, 2) float64, their known x and y in the map frame, metres.
+
+    Returns:
+        (H,) int64.
+    """
+    groups = [rows for rows in grouped(component) if farthest_m(positions_m[rows]) >= LEAST_APART_M]
+    return component[np.array([rows[0] for rows in groups], np.int64)]
+
+
+def farthest_m(positions_m: Array) -> float:
+    """Largest distance of (A, 2) positions, metres in the map frame, from the first; A >= 1."""
+    return float(np.linalg.norm(positions_m - positions_m[0], axis=1).max())
+
+
 def anchor(
     graph: ExperienceGraph,
     placed: Mapping[NodeId, SE3],

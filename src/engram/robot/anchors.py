@@ -29,7 +29,14 @@ from engram.frontend.matching import match_frames, pair_seed
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Anchor, Clock, Edge, EdgeKind, Goal, LandmarkSource, Node
 from engram.graph.placing import DEFAULT_CONFIG as PLACING
-from engram.graph.placing import Anchored, PlacingConfig, Poses, anchor
+from engram.graph.placing import (
+    LEAST_APART_M,
+    Anchored,
+    PlacingConfig,
+    Poses,
+    anchor,
+    farthest_m,
+)
 from engram.localiser.acceptance import AcceptanceConfig
 from engram.localiser.relocalisation import Relocaliser, Suggested
 from engram.mapper.loops import edges_agree
@@ -356,8 +363,6 @@ def nodes_near(
 
 # Standard deviation of an anchor whose line names none, metres: a GPS receiver's, a click's.
 _GPS_SIGMA_M, _GRID_SIGMA_M = 2.0, 0.3
-# Anchors must be this far apart to tell a direction, metres.
-_LEAST_APART_M = 5.0
 # An anchor this many standard deviations off does not fit.
 _OUTLIER_SIGMAS = 4.0
 
@@ -513,11 +518,11 @@ def _origin(store: Map, known: list[GivenAnchor]) -> tuple[float, float]:
 
 
 def _check_spread(positions: NDArray[np.float64], source: Path) -> None:
-    far_m = np.linalg.norm(positions - positions[0], axis=1).max()
-    if not far_m >= _LEAST_APART_M:
+    far_m = farthest_m(positions)
+    if not far_m >= LEAST_APART_M:
         raise InputError(
             f"{source}: its anchors lie within {far_m:.1f} m; at least two must be "
-            f"{_LEAST_APART_M:.0f} m apart to determine a direction"
+            f"{LEAST_APART_M:.0f} m apart to determine a direction"
         )
 
 

@@ -24,7 +24,8 @@ from engram.counts import counted
 from engram.errors import InputError, extra
 from engram.files import check_output
 from engram.graph.clock import hour_of_day
-from engram.graph.model import Session
+from engram.graph.model import Anchor, Session
+from engram.graph.placing import held_by_anchors
 from engram.maps.difference import MapDifference
 from engram.maps.map import Map
 from engram.maps.placed import PlacedNodes
@@ -336,7 +337,7 @@ class MapAbove:
         placed: the nodes.
         points_m: (N, 2) float64, x and y in the map frame, metres.
         part: (N,) int64, number of the part of each node, 0 the largest. How two parts lie to each
-            other is unknown.
+            other is unknown: neither edges nor anchors determine it.
         starts: (N,) bool, the first node of each drive.
         goals: part and x and y in the map frame, metres, by name.
     """
@@ -350,6 +351,11 @@ class MapAbove:
     def sizes(self) -> list[int]:
         """Number of nodes of each part."""
         return [int(count) for count in np.bincount(self.part)]
+
+    def pieces(self) -> list[int]:
+        """Number of unconnected pieces of each part; where more than one, anchors hold them."""
+        both = np.unique(np.stack([self.part, self.placed.component], axis=1), axis=0)
+        return [int(count) for count in np.bincount(both[:, 0])]
 
     def labels(self, by: str) -> Labels:
         """What colours the nodes, by a key of `COLOURS`."""
@@ -368,13 +374,24 @@ class MapAbove:
 def map_above(opened: Map) -> MapAbove:
     """A map from above, as of its revision."""
     placed = opened.placed()
-    part = _by_size(placed.component)
-    part_of = {uuid.tobytes(): int(number) for uuid, number in zip(placed.uuids, part, strict=True)}
+    row_of = {uuid.tobytes(): row for row, uuid in enumerate(placed.uuids)}
+    part = _by_size(_in_one_frame(placed.component, row_of, opened.anchors))
     goals = {}
     for name, goal in sorted(opened.goals.items()):
         place = opened.frame.locate(goal)
-        goals[name] = part_of[goal.node.bytes], place.x_m, place.y_m
+        goals[name] = int(part[row_of[goal.node.bytes]]), place.x_m, place.y_m
     return MapAbove(placed, placed.positions[:, :2], part, _starts(placed), goals)
+
+
+def _in_one_frame(
+    component: NDArray[np.int64], row_of: Mapping[bytes, int], anchors: Sequence[Anchor]
+) -> NDArray[np.int64]:
+    """(N,) int64 components, those that anchors hold in the map frame as one."""
+    known = [one for one in anchors if one.node.bytes in row_of]
+    at = np.array([row_of[one.node.bytes] for one in known], np.int64)
+    positions_m = np.array([(one.x_m, one.y_m) for one in known]).reshape(-1, 2)
+    held = held_by_anchors(component[at], positions_m)
+    return np.where(np.isin(component, held), held.min(initial=len(component)), component)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

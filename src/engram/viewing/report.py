@@ -294,9 +294,7 @@ def map_page(path: Path, next_commands: Sequence[str], weak: WeakSpotsConfig | N
         f"{counted(facts['nodes'], 'node')} of {counted(facts['sessions'], 'drive')} by "
         f"{counted(len(facts['robots']), 'robot')}, {facts['mapped_m']:.0f} m mapped; "
     )
-    verdict += "one connected part." if facts["components"] == 1 else (
-        f"{counted(facts['components'], 'part')} whose places relative to each other are unknown."
-    )  # fmt: skip
+    verdict += _parts_verdict(parts.above.pieces())
     tiles = [
         ("nodes", f"{facts['nodes']}"),
         ("experiences", f"{facts['experiences']}"),
@@ -321,6 +319,17 @@ def map_page(path: Path, next_commands: Sequence[str], weak: WeakSpotsConfig | N
         commands(next_commands),
     ]
     return Page(path.name, verdict, sections)
+
+
+def _parts_verdict(pieces: Sequence[int]) -> str:
+    """What holds a map together, by the unconnected pieces of each of its parts."""
+    if list(pieces) == [1]:
+        return "one connected part."
+    held = [f"anchors hold {count} unconnected pieces together" for count in pieces if count > 1]
+    if len(pieces) != 1:
+        parts = counted(len(pieces), "part")
+        held.append(f"{parts} whose places relative to each other are unknown")
+    return f"{'; '.join(held)}."
 
 
 def _weak_section(found: WeakSpots, opened: Map) -> list[str]:

@@ -34,6 +34,7 @@ def drawn(path: Path, version: str, revision: int) -> bytes:
     body: dict[str, Any] = {
         "revision": revision,
         "parts": above.sizes(),
+        "pieces": above.pieces(),
         "goals": [[printable(name), *goal] for name, goal in above.goals.items()],
         "by": {
             by: {

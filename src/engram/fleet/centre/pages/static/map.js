@@ -125,7 +125,8 @@ function draw() {
 // A button with a small drawing for each part, where there are several.
 function drawParts() {
   const several = shown.parts.length > 1;
-  relation.hidden = parts.hidden = !several;
+  parts.hidden = !several;
+  tellRelation();
   const rest = shown.parts.slice(BUTTONS);
   const buttons = several ? shown.parts.slice(0, BUTTONS).map(partButton) : [];
   parts.replaceChildren(...buttons);
@@ -145,10 +146,20 @@ function partButton(nodes, number) {
   return button;
 }
 
+// What joins the part that is shown, and what the others.
+function tellRelation() {
+  const pieces = shown.pieces[part] || 0, said = [];
+  if (pieces > 1) said.push(`No drive joins the ${pieces} pieces shown: anchors hold them together.`);
+  if (shown.parts.length > 1) said.push("How the parts lie to each other is unknown: neither drives nor anchors join them. One is shown at a time.");
+  relation.textContent = said.join(" ");
+  relation.hidden = !said.length;
+}
+
 function show(number) {
   part = number;
   view = fitted(canvas, part);
   [...parts.children].forEach((button, k) => button.setAttribute("aria-pressed", String(k === part)));
+  tellRelation();
   draw();
 }
 
