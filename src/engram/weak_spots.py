@@ -130,6 +130,11 @@ class Places:
         """(P,) metres."""
         return self.to_m - self.from_m
 
+    def along(self, session: int, from_m: float, to_m: float) -> NDArray[np.bool_]:
+        """(P,) whether each place lies between two distances of a drive, by its number, metres."""
+        inside = (self.from_m >= from_m) & (self.to_m <= to_m)
+        return np.asarray(inside & (self.session == session))
+
     def pooling(self, pool_m: float) -> Array:
         """(P, P) weight of each place's evidence at each other of the same drive."""
         middle_m = (self.from_m + self.to_m) / 2

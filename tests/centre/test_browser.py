@@ -93,6 +93,55 @@ def test_the_map_by_keyboard_and_slider(page):
     assert page.inner_text("#legend li") == "r1 (3 nodes)"
 
 
+def test_weak_spots_are_drawn_listed_and_zoomed_to_by_keyboard(page):
+    page.get_by_text("3 of 6 nodes, in part 1 of 2").wait_for()
+    drawn = "canvas.toDataURL()"
+    plain, held = page.evaluate(drawn), queue.SimpleQueue()
+    page.route("**/weak-spots?at=*", lambda route: held.put(route, block=False))
+    page.check("#weak")
+    page.get_by_text("loading…").wait_for()
+    held.get().abort()
+    page.get_by_text("weak spots cannot be shown").wait_for()
+    assert page.evaluate(drawn) == plain
+    page.unroute("**/weak-spots?at=*")
+    page.uncheck("#weak")
+    page.check("#weak")
+    page.get_by_text("of the next drive is expected to be missed").wait_for()
+    assert page.evaluate(drawn) != plain
+    first = page.locator("#weak-list button").first
+    assert " m missed, " in first.inner_text()
+    assert page.inner_text("#weak-advice button").startswith("Drive this next: ")
+    page.evaluate("view.scale /= 100")
+    before = page.evaluate("view.scale")
+    first.press("Enter")
+    assert first.get_attribute("aria-pressed") == "true"
+    assert page.evaluate("view.scale") > 2 * before
+    assert page.evaluate("stretch.nodes.every((i) => shown.part[i] === part)")
+    page.focus("#slider")
+    page.keyboard.press("ArrowLeft")
+    page.get_by_text("3 nodes", exact=True).wait_for()
+    page.locator("#weak-list button").first.wait_for()
+    assert page.evaluate("[weak.revision, shown.revision]") == [1, 1]
+    page.uncheck("#weak")
+    assert page.locator("#weak-panel").is_hidden()
+
+
+def test_weak_spots_stay_those_of_the_revision_that_is_shown(page):
+    """The slider moves while they are on their way: what arrives late is not drawn."""
+    page.get_by_text("3 of 6 nodes").wait_for()
+    held = queue.SimpleQueue()
+    page.route("**/weak-spots?at=2", lambda route: held.put(route, block=False))
+    page.check("#weak")
+    late = held.get()
+    page.focus("#slider")
+    page.keyboard.press("ArrowLeft")
+    page.get_by_text("3 nodes", exact=True).wait_for()
+    page.get_by_text("loading…").wait_for()
+    late.continue_()
+    page.locator("#weak-list button").first.wait_for()
+    assert page.evaluate("[weak.revision, shown.revision]") == [1, 1]
+
+
 def test_parts_that_anchors_hold_are_shown_together(page, site, tmp_path):
     page.get_by_text("How the parts lie to each other is unknown").wait_for()
     path, anchors = site.centre.map_path(NAME), tmp_path / "anchors.csv"

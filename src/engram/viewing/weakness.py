@@ -19,6 +19,8 @@ from engram.viewing.drawings import (
     BRIDGED,
     GOOD,
     LOST,
+    Labels,
+    MapAbove,
     Track,
     check_picture,
     draw_parts,
@@ -82,13 +84,23 @@ def advice_text(advice: Advice, opened: Map) -> str:
 def verdict(found: WeakSpots) -> str:
     """What is expected to be missed, in one sentence."""
     if not found.drives:
-        return "the map has no drive"
+        return "no weak spot is known: the map has no drive"
+    missed = f"{found.missed:.1%} of the next drive is expected to be missed"
+    if not found.spots:
+        return f"no weak spot is known; {missed}"
     share = sum(one.expected for one in found.spots)
     return (
-        f"{found.missed:.1%} of the next drive is expected to be missed; {share:.0%} of that lies "
-        f"in {counted(len(found.spots), 'weak spot')}, {found.named_share:.0%} of "
-        f"{found.route_m:.0f} m and their hours"
+        f"{missed}; {share:.0%} of that lies in {counted(len(found.spots), 'weak spot')}, "
+        f"{found.named_share:.0%} of {found.route_m:.0f} m and their hours"
     )
+
+
+def unknown_hours_text(found: WeakSpots) -> str:
+    """How many drives have no hour, and what to do; "" if none."""
+    if not found.unknown_hours:
+        return ""
+    drives = counted(found.unknown_hours, "drive")
+    return f"{drives} with no known hour, counted at every hour; engram amend sets it"
 
 
 def weak_spots_text(found: WeakSpots, opened: Map) -> str:
@@ -99,10 +111,7 @@ def weak_spots_text(found: WeakSpots, opened: Map) -> str:
         lines.append(f"and {len(rows) - _LISTED} with less missed: --json lists all")
     lines.append(verdict(found))
     if found.unknown_hours:
-        lines.append(
-            f"{counted(found.unknown_hours, 'drive')} with no known hour, counted at every hour; "
-            "engram amend sets it"
-        )
+        lines.append(unknown_hours_text(found))
     if found.advice is not None:
         lines.append(advice_text(found.advice, opened))
     return "\n".join(lines)
@@ -112,30 +121,62 @@ def _line(row: Sequence[str]) -> str:
     return "  ".join(f"{text:{width}s}" for text, width in zip(row, _WIDTHS, strict=True)).rstrip()
 
 
+def weakness_labels(found: WeakSpots, places: NDArray[np.int64]) -> Labels:
+    """What colours nodes: the share of their places that drives will probably miss.
+
+    Args:
+        places: (N,) int64, the place of each node; see `places_above`.
+    """
+    demand_m = found.weakness.demand_m.sum(axis=1)
+    missed = found.weakness.expected_m.sum(axis=1) / np.maximum(demand_m, 1e-12)
+    kind = np.digitize(np.append(missed, 0.0)[places], [limit for limit, _, _ in _CLASSES[:-1]])
+    return Labels(
+        tuple(name for _, name, _ in _CLASSES),
+        tuple(colour for _, _, colour in _CLASSES),
+        kind.astype(np.int64),
+    )
+
+
+def places_above(found: WeakSpots, opened: Map, above: MapAbove) -> NDArray[np.int64]:
+    """(N,) int64, the number of the place of each node of a map from above; -1 without one."""
+    nodes = [NodeId(UUID(bytes=one.tobytes())) for one in above.placed.uuids]
+    return found.places.of_node[np.array([opened.graph.index(one) for one in nodes], np.int64)]
+
+
+def nodes_along(
+    stretch: Spot | Advice, found: WeakSpots, opened: Map, places: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """(K,) int64, ascending: nodes at the places of a stretch, whichever drive saved them.
+
+    Args:
+        places: (N,) int64, the place of each node; see `places_above`.
+    """
+    session = opened.graph.session_number(stretch.session)
+    assert session is not None  # it is measured along a drive that saved nodes
+    inside = found.places.along(session, stretch.from_m, stretch.to_m)
+    return np.flatnonzero(np.isin(places, np.flatnonzero(inside)))
+
+
 def draw_weakness(found: WeakSpots, opened: Map, title: str = "") -> Any:
     """A figure of a map from above, coloured by how much of each place is missed."""
     parts = parts_of(opened, title=title)
     above = parts.above
-    nodes = [NodeId(UUID(bytes=one.tobytes())) for one in above.placed.uuids]
-    place = found.places.of_node[np.array([opened.graph.index(one) for one in nodes], np.int64)]
-    demand_m = found.weakness.demand_m.sum(axis=1)
-    missed = found.weakness.expected_m.sum(axis=1) / np.maximum(demand_m, 1e-12)
-    kind = np.digitize(np.append(missed, 0.0)[place], [limit for limit, _, _ in _CLASSES[:-1]])
+    labels = weakness_labels(found, places_above(found, opened, above))
     panels = [
-        replace(panel, tracks=_tracks(above.points_m, kind, above.part == number))
+        replace(panel, tracks=_tracks(above.points_m, labels, above.part == number))
         for number, panel in enumerate(parts.panels)
     ]
     return draw_parts(panels)
 
 
 def _tracks(
-    points_m: NDArray[np.float64], kind: NDArray[np.intp], chosen: NDArray[np.bool_]
+    points_m: NDArray[np.float64], labels: Labels, chosen: NDArray[np.bool_]
 ) -> list[Track]:
-    """A track for each class of weakness that some chosen points, (N,) bool, are of."""
-    of_kind = [chosen & (kind == number) for number in range(len(_CLASSES))]
+    """A track for each label that some chosen points, (N,) bool, have."""
+    of_label = [chosen & (labels.of_node == number) for number in range(len(labels.names))]
     return [
-        Track(label, points_m[which], colour)
-        for which, (_, label, colour) in zip(of_kind, _CLASSES, strict=True)
+        Track(name, points_m[which], colour)
+        for which, name, colour in zip(of_label, labels.names, labels.colours, strict=True)
         if which.any()
     ]
 

@@ -17,7 +17,13 @@ from engram.fleet.centre import dreams, handins, jobs
 from engram.fleet.centre.access import Role, Subject, names_of, subject_of
 from engram.fleet.centre.database import newest_events
 from engram.fleet.centre.fleet import RobotListed, refs_of, revision_of, robots_of, version_of
-from engram.fleet.centre.pages.positions import changes, drawn, thumbnail
+from engram.fleet.centre.pages.positions import (
+    changes,
+    drawn,
+    thumbnail,
+    weak_spots,
+    weak_spots_of,
+)
 from engram.fleet.centre.problems import CentreError, UnknownError
 from engram.fleet.centre.requests import COOKIE, Asking, CentreHere, takes, who_asks
 from engram.fleet.centre.service import Centre
@@ -30,7 +36,8 @@ router = APIRouter(include_in_schema=False)
 VIEWERS = [takes(Role.VIEWER)]
 _SHOWN = 200
 _LONGEST_LOGIN = 4096
-_STATIC = {"page.js": "text/javascript", "map.js": "text/javascript", "page.css": "text/css"}
+_SCRIPTS = ("page.js", "map.js", "weak-spots.js")
+_STATIC = {**dict.fromkeys(_SCRIPTS, "text/javascript"), "page.css": "text/css"}
 # Nothing comes from elsewhere, and nobody frames the pages.
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
@@ -133,6 +140,17 @@ def nodes(name: str, centre: CentreHere, at: int | None = None) -> Response:
     """What the map page draws."""
     revision = revision_of(centre, name, "head" if at is None else str(max(at, 0)))
     body = drawn(centre.map_path(name), version_of(centre, name, revision), revision)
+    return Response(body, media_type="application/json")
+
+
+@router.get("/maps/{name}/weak-spots", dependencies=VIEWERS)
+def weak(name: str, centre: CentreHere, at: int | None = None) -> Response:
+    """What the map page draws of weak spots."""
+    revision = revision_of(centre, name, "head" if at is None else str(max(at, 0)))
+    with centre.reading(name) as store:
+        if store.revision == revision:
+            return Response(store.derived(weak_spots), media_type="application/json")
+    body = weak_spots_of(centre.map_path(name), version_of(centre, name, revision), revision)
     return Response(body, media_type="application/json")
 
 

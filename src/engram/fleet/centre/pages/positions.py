@@ -1,4 +1,4 @@
-"""What the page of a map shows: its nodes from above, part by part; pictures; what changed."""
+"""What the page of a map shows: its nodes from above, its weak spots, pictures, what changed."""
 
 from __future__ import annotations
 
@@ -14,12 +14,25 @@ from engram.counts import counted
 from engram.maps.difference import MapDifference, Region
 from engram.maps.map import Map
 from engram.untrusted import printable
-from engram.viewing.drawings import COLOURS, map_above
+from engram.viewing.drawings import COLOURS, Labels, map_above
 from engram.viewing.moments import drive_text
+from engram.viewing.weakness import (
+    HEAD,
+    advice_text,
+    nodes_along,
+    places_above,
+    spot_rows,
+    unknown_hours_text,
+    verdict,
+    weakness_labels,
+)
+from engram.weak_spots import find_weak_spots
 
 _KEPT = 8
 # Of nodes that a revision added.
 _PICTURES = 4
+# Weak spots that people read.
+_SPOTS = 40
 
 
 @lru_cache(maxsize=_KEPT)
@@ -29,21 +42,13 @@ def drawn(path: Path, version: str, revision: int) -> bytes:
     with Map.open(path, at=revision) as store:
         above = map_above(store)
     placed = above.placed
-    labels = {by: above.labels(by) for by in COLOURS}
     x_m, y_m = np.round(above.points_m, 2).T.tolist()
     body: dict[str, Any] = {
         "revision": revision,
         "parts": above.sizes(),
         "pieces": above.pieces(),
         "goals": [[printable(name), *goal] for name, goal in above.goals.items()],
-        "by": {
-            by: {
-                "names": [printable(name) for name in one.names],
-                "colours": one.colours,
-                "of": one.of_node.tolist(),
-            }
-            for by, one in labels.items()
-        },
+        "by": {by: _colours(above.labels(by)) for by in COLOURS},
         "node": [str(UUID(bytes=uuid.tobytes())) for uuid in placed.uuids],
         "x": x_m,
         "y": y_m,
@@ -53,6 +58,55 @@ def drawn(path: Path, version: str, revision: int) -> bytes:
         "starts": np.flatnonzero(above.starts).tolist(),
     }
     return json.dumps(body, separators=(",", ":")).encode()
+
+
+def weak_spots(store: Map) -> bytes:
+    """The weak spots of a revision as JSON, in the words and colours of ``engram report``.
+
+    Nodes are numbered as in `drawn`. `Map.derived` keeps it, as it reads the whole map.
+    """
+    found, above = store.derived(find_weak_spots), map_above(store)
+    places = places_above(found, store, above)
+    rows = spot_rows(found, store)[:_SPOTS]
+    spots = [
+        {
+            **dict(zip(HEAD, row, strict=True)),
+            "share": one.missed,
+            "length_m": one.to_m - one.from_m,
+            "nodes": nodes_along(one, found, store, places).tolist(),
+        }
+        for one, row in zip(found.spots, rows, strict=False)
+    ]
+    advice = found.advice and {
+        "text": advice_text(found.advice, store),
+        "nodes": nodes_along(found.advice, found, store, places).tolist(),
+    }
+    body: dict[str, Any] = {
+        "revision": store.revision,
+        "verdict": verdict(found),
+        "unknown_hours": unknown_hours_text(found),
+        "spots": spots,
+        "more": len(found.spots) - len(spots),
+        "advice": advice,
+        "colours": _colours(weakness_labels(found, places)),
+    }
+    return json.dumps(body, separators=(",", ":")).encode()
+
+
+@lru_cache(maxsize=_KEPT)
+def weak_spots_of(path: Path, version: str, revision: int) -> bytes:
+    """`weak_spots` of a revision that is not the newest, kept by version as in `drawn`."""
+    del version
+    with Map.open(path, at=revision) as store:
+        return weak_spots(store)
+
+
+def _colours(labels: Labels) -> dict[str, Any]:
+    return {
+        "names": [printable(name) for name in labels.names],
+        "colours": labels.colours,
+        "of": labels.of_node.tolist(),
+    }
 
 
 def thumbnail(store: Map, node: str) -> bytes | None:

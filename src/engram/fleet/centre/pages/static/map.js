@@ -15,18 +15,19 @@ let chosen = -1; // place of a node in the columns of `shown`
 let steps = 0; // asked for before the nodes came
 let asked = 0;
 
+const colours = () => weakHere()?.colours || shown.by[colour.value];
 const isFresh = (i) => !fresh.checked || shown.added[i] === shown.revision;
 const sharpness = () => window.devicePixelRatio || 1;
 
-function fitted(sheet, number) {
-  const some = shown ? shown.members[number] || [] : [];
+// The middle of some nodes, and pixels a metre at which a sheet shows them, and `least` metres.
+function fitted(sheet, some, least = 5) {
   if (!some.length) return { x: 0, y: 0, scale: 1 };
   let [x0, x1, y0, y1] = [Infinity, -Infinity, Infinity, -Infinity];
   for (const i of some) {
     x0 = Math.min(x0, shown.x[i]); x1 = Math.max(x1, shown.x[i]);
     y0 = Math.min(y0, shown.y[i]); y1 = Math.max(y1, shown.y[i]);
   }
-  const scale = 0.88 * Math.min(sheet.width / Math.max(x1 - x0, 5), sheet.height / Math.max(y1 - y0, 5));
+  const scale = 0.88 * Math.min(sheet.width / Math.max(x1 - x0, least), sheet.height / Math.max(y1 - y0, least));
   return { x: (x0 + x1) / 2, y: (y0 + y1) / 2, scale };
 }
 
@@ -35,9 +36,10 @@ const py = (sheet, eye, y) => sheet.height / 2 - (y - eye.y) * eye.scale;
 
 // Chains of nodes as lines, in the direction of the drives; their nodes as dots.
 function paint(sheet, eye, number, isWhole) {
-  const brush = sheet.getContext("2d"), labels = shown.by[colour.value], dpr = sharpness();
+  const brush = sheet.getContext("2d"), labels = colours(), dpr = sharpness();
   brush.fillStyle = "#fff";
   brush.fillRect(0, 0, sheet.width, sheet.height);
+  if (isWhole) paintWeak(sheet, eye, number);
   const dot = (isWhole ? Math.max(3, Math.min(6, eye.scale * 0.5 / dpr)) : 2) * dpr;
   const spacing = sheet.width / 10;
   const ends = new Map();
@@ -56,7 +58,9 @@ function paint(sheet, eye, number, isWhole) {
     ends.set(shown.chain[i], { x, y, label, way });
     brush.fillRect(x - dot / 2, y - dot / 2, dot, dot);
   }
-  if (isWhole) mark(sheet, eye, number, dot);
+  if (!isWhole) return;
+  mark(sheet, eye, number, dot);
+  numberWeak(sheet, eye, number);
 }
 
 function arrow(brush, from, x, y, size) {
@@ -75,7 +79,7 @@ function ring(brush, x, y, radius, fill) {
 
 // Starts of drives, goals, the chosen node.
 function mark(sheet, eye, number, dot) {
-  const brush = sheet.getContext("2d"), labels = shown.by[colour.value], dpr = sharpness();
+  const brush = sheet.getContext("2d"), labels = colours(), dpr = sharpness();
   const place = (x, y) => [px(sheet, eye, x), py(sheet, eye, y)];
   brush.lineWidth = 2 * dpr;
   for (const i of shown.starts)
@@ -106,7 +110,8 @@ function scaleBar(brush, sheet, eye, dpr) {
 function draw() {
   if (!shown) return;
   paint(canvas, view, part, true);
-  const some = shown.members[part].filter(isFresh), labels = shown.by[colour.value];
+  const some = shown.members[part].filter(isFresh), labels = colours();
+  colour.disabled = labels !== shown.by[colour.value];
   const counts = labels.names.map(() => 0);
   for (const i of some) counts[labels.of[i]] += 1;
   const all = counted(shown.node.length, "node"), several = shown.parts.length > 1;
@@ -120,6 +125,7 @@ function draw() {
     return item;
   }));
   if (some.length) legend.append(Object.assign(document.createElement("li"), { textContent: "○ start of a drive" }));
+  if (weakHere()?.spots.length) legend.append(Object.assign(document.createElement("li"), { textContent: "broad, numbered: weak spot, broader the more is missed" }));
 }
 
 // A button with a small drawing for each part, where there are several.
@@ -134,7 +140,7 @@ function drawParts() {
     const nodes = rest.reduce((sum, one) => sum + one, 0);
     parts.append(`and ${counted(rest.length, "smaller part")} (${counted(nodes, "node")}): N goes through them`);
   }
-  buttons.forEach((button, number) => paint(button.firstChild, fitted(button.firstChild, number), number, false));
+  buttons.forEach((button, number) => paint(button.firstChild, fitted(button.firstChild, shown.members[number]), number, false));
 }
 
 function partButton(nodes, number) {
@@ -157,7 +163,7 @@ function tellRelation() {
 
 function show(number) {
   part = number;
-  view = fitted(canvas, part);
+  view = fitted(canvas, shown.members[part]);
   [...parts.children].forEach((button, k) => button.setAttribute("aria-pressed", String(k === part)));
   tellRelation();
   draw();
@@ -205,15 +211,22 @@ async function load() {
   found.members = found.parts.length ? found.parts.map(() => []) : [[]];
   found.part.forEach((number, i) => found.members[number].push(i));
   found.order = found.members.flat();
+  const newest = new Map();
+  found.before = found.chain.map((chain, i) => { // the node before it in its drive
+    const before = newest.get(chain);
+    newest.set(chain, i);
+    return before;
+  });
   found.asked = mine;
   shown = found;
   chosen = shown.node.indexOf(node);
   // The part that was shown stays, and the view with it while some of it is in sight.
   part = Math.max(shown.part[shown.node.indexOf(root)] || 0, 0);
-  if (!view || !root || !inSight()) view = fitted(canvas, part);
+  if (!view || !root || !inSight()) view = fitted(canvas, shown.members[part]);
   turnToFresh();
   drawParts();
   draw();
+  if (weakSwitch.checked) loadWeak();
   if (steps) { const by = steps; steps = 0; step(by); }
 }
 
@@ -234,7 +247,7 @@ function inSight() {
 function resize() {
   canvas.width = canvas.clientWidth * sharpness();
   canvas.height = canvas.clientHeight * sharpness();
-  if (shown) { view = fitted(canvas, part); draw(); }
+  if (shown) { view = fitted(canvas, shown.members[part]); draw(); }
 }
 
 function zoom(factor) {
