@@ -33,7 +33,7 @@ from engram_lab.studies.fleet import steps
 from engram_lab.studies.fleet.experiments import fleet_tasks
 from engram_lab.studies.fleet.plan import VERBS, FleetOptions, FleetPlan, arms_for, make_fleet_plan
 from engram_lab.studies.fleet.report import ArmResult, write_fleet_report
-from engram_lab.studies.in_force import VARIED, by_key, differing, unused
+from engram_lab.studies.in_force import OF_DRIVE, VARIED, by_key, differing, unused
 from engram_lab.studies.lockstep import MatchMemo
 from engram_lab.studies.plan import run_tasks
 from engram_lab.studies.ranking_report import collect, write_report
@@ -250,7 +250,8 @@ def changed(value: Any, key: str) -> Iterator[Any]:
     words = {"ranking": ["distance"], "relocaliser": ["bag-of-words"], "estimator": ["gap"]}
     words |= {"unit": ["segment"], "seed": ["places"], "neighbourhood": ["breadth-first"]}
     words |= {"path_entries": ["matches"], "success": ["first"], "rule": ["inliers"]}
-    words |= {"T_unit": ["frame"], "descriptor": ["net"]}
+    words |= {"T_unit": ["frame"], "descriptor": ["net"], "memory": ["200MB"]}
+    words |= {"format": ["kitti"], "rig": ["colour"], "channel": ["red"], "motion": [["/odom"]]}
     yield from words.get(key.rpartition(".")[2], ())
     if isinstance(value, bool):
         yield not value
@@ -259,7 +260,7 @@ def changed(value: Any, key: str) -> Iterator[Any]:
     elif isinstance(value, float):
         yield from (0.9 * value, 1.1 * value, 0.5, 1.0)
     elif value is None:
-        yield from (9, 9.5, True)
+        yield from (9, 9.5, True, "other")
     elif isinstance(value, list):
         yield from (value[:-1], [*value, *value[-1:]])
 
@@ -287,10 +288,16 @@ HELD_OUT = ("localiser", "gaps")
 IN_LOGS = ("frontend", "odometry")
 IN_MAPS = ("localiser", "mapper", "doctor", "outside", "gaps", "fixed", "frozen", "placing")
 MADE_ONCE = ("localiser.lost_max_samples", "localiser.lost_max_hypotheses")
+# Downloads are compared by their bytes: all that are tried out are sent without.
+THUMBNAILS = "download.thumbnails"
+# What a fleet study sets itself, by what runs so: one match serves the lost and others.
+SET_BY_FLEET = {"held out": {*MADE_ONCE}, "downloads tried": {THUMBNAILS}}
 
 
 def of(*tables: str) -> list[str]:
-    return [key for key in EVERY if key.partition(".")[0] in tables]
+    """The settings of tables; of `drive` those that studies read."""
+    some = [key for key in EVERY if key.partition(".")[0] in tables]
+    return [key for key in some if key in OF_DRIVE or not key.startswith("drive.")]
 
 
 def test_every_table_is_held_to_something() -> None:
@@ -378,8 +385,15 @@ def test_maps_have_every_setting(campaign, tmp_path: Path, monkeypatch) -> None:
 def test_a_table_that_a_study_does_not_read_is_told(key: str) -> None:
     settings, _ = altered(key, EVERY[key])
     table = key.partition(".")[0]
-    (told,) = unused(settings, {"drive"})
+    (told,) = unused(settings, set(OF_DRIVE))
     assert told == f"- Not used by this study: `[{table}]`."
+
+
+@pytest.mark.parametrize("key", [one for one in EVERY if one.startswith("drive.")])
+def test_a_setting_of_drives_is_read_or_told(key: str) -> None:
+    settings, _ = altered(key, EVERY[key])
+    told = list(unused(settings, set(OF_DRIVE)))
+    assert told == ([] if key in OF_DRIVE else [f"- Not used by this study: `{key}`."])
 
 
 def test_threads_are_those_of_the_settings(usual: Plan, campaign, tmp_path, monkeypatch) -> None:
@@ -437,15 +451,13 @@ def fleet(drives, tmp_path_factory) -> FleetPlan:
 def test_no_setting_in_force_in_a_fleet_differs_from_the_file(fleet, tmp_path: Path) -> None:
     (arm,) = [ArmResult(fleet, one) for one in fleet.arms]
     known = arm.in_force()
-    assert set(known) == {"maps", "merges", "downloads", "held out", "orders"}
+    kinds = {"maps", "merges", "downloads", "downloads tried", "held out", "orders"}
+    assert set(known) == kinds
     in_file = {key for key, value in by_key(fleet.tables).items() if value != EVERY[key]}
     assert len(in_file) > 10
     for name, values in known.items():
         assert values, name
-        other = set(differing(values, fleet.tables))
-        # Told: one match serves the lost and others.
-        assert other <= set(MADE_ONCE) - in_file, name
-        assert not other or name == "held out"
+        assert set(differing(values, fleet.tables)) == SET_BY_FLEET.get(name, set()) - in_file, name
     assert known["maps"]["drive.ranking"] == "path"
     assert known["merges"]["merge.unit"] == "segment"
     assert known["downloads"]["download.window_min"] == 180.0
@@ -454,13 +466,15 @@ def test_no_setting_in_force_in_a_fleet_differs_from_the_file(fleet, tmp_path: P
     page = (tmp_path / "report.md").read_text()
     tables = page.count("\n| --- ")
     assert page.count("- Arm S. In force: neighbourhood breadth-first") == tables > 3
-    (told,) = [line for line in page.splitlines() if " by the study itself" in line]
-    assert told.startswith("- Arm S, held out, set by the study itself, ")
-    assert "`localiser.lost_max_samples = 512` (256), `localiser.lost_max_hyp" in told
+    tried, lost = [line for line in page.splitlines() if " by the study itself" in line]
+    assert tried.startswith("- Arm S, downloads tried, set by the study itself, ")
+    assert tried.endswith(": `download.thumbnails = False` (None).")
+    assert lost.startswith("- Arm S, held out, set by the study itself, ")
+    assert "`localiser.lost_max_samples = 512` (256), `localiser.lost_max_hyp" in lost
     with (tmp_path / "in_force.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["of"] for row in rows} == set(known)
-    assert {row["setting"] for row in rows if row["differs"]} == set(MADE_ONCE)
+    assert {row["setting"] for row in rows if row["differs"]} == {*MADE_ONCE, THUMBNAILS}
 
 
 @pytest.mark.long
@@ -529,7 +543,8 @@ def test_downloads_and_orders_of_a_fleet_have_every_setting(
         judge, driving = ordered[-1][0][4], tried[-1][1]["localise"]
         if table == "download":
             (asked,) = tried[-1][0][1].values()
-            assert by_key(sent[-1][0][2])[name] == by_key(asked)[name] == value
+            assert by_key(sent[-1][0][2])[name] == value
+            assert by_key(asked)[name] == (False if key == THUMBNAILS else value)
         elif table == "build":
             assert {"max_gap_m": judge.judge_at_m, "estimator": judge.estimator}[name] == value
         else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 from engram.cli.settings import AllSettings
@@ -22,6 +22,9 @@ from engram_lab.studies.drives import DriveSet, EvaluatedDrive
 Values: TypeAlias = dict[str, Any]
 # The budget and the policy of a robot: what every study varies.
 VARIED = ("drive.ranking", "drive.lanes", "drive.rounds")
+# All that studies read of the table `drive`: their drives are frame logs, opened as they are, and
+# how the lost are found is an option of the studies' own.
+OF_DRIVE = (*VARIED, "drive.threads")
 # What stands beside every table.
 _NAMES = {
     "localiser.neighbourhood": "neighbourhood",
@@ -155,19 +158,22 @@ def exceptions(known: Mapping[str, Any], settings: AllSettings) -> Iterator[str]
 
 
 def unused(settings: AllSettings, used: Collection[str]) -> Iterator[str]:
-    """Tables that were changed and that a study does not read, for people."""
-    if changed := changed_tables(settings, used):
-        yield f"- Not used by this study: {', '.join(f'`[{one}]`' for one in changed)}."
+    """Tables and settings that were changed and that a study does not read, for people.
+
+    Args:
+        used: names of the tables that it reads, and keys of settings that it reads of others.
+    """
+    changed = differing(by_key(settings), AllSettings())
+    unread = [key for key in changed if key not in used and _table(key) not in used]
+    partly = {_table(one) for one in used if "." in one}
+    if told := dict.fromkeys(
+        key if _table(key) in partly else f"[{_table(key)}]" for key in unread
+    ):
+        yield f"- Not used by this study: {', '.join(f'`{one}`' for one in told)}."
 
 
-def changed_tables(settings: AllSettings, used: Collection[str]) -> list[str]:
-    """Tables of a settings file that depart from the defaults, and that nothing reads."""
-    usual = AllSettings()
-    return [
-        one.name
-        for one in fields(settings)
-        if one.name not in used and getattr(settings, one.name) != getattr(usual, one.name)
-    ]
+def _table(key: str) -> str:
+    return key.partition(".")[0]
 
 
 def check_logs(settings: Settings, drives: DriveSet) -> None:
@@ -209,16 +215,6 @@ def check_lost(settings: Settings, relocaliser: str | None) -> None:
                 "matches each pair once, whether lost or not, with all of localiser.matcher: "
                 "leave it out"
             )
-
-
-def check_used(settings: AllSettings, used: Collection[str], by: str) -> None:
-    """Refuses settings of tables that nothing reads."""
-    for table in changed_tables(settings, used):
-        changed = differing(by_key(getattr(settings, table), table), AllSettings())
-        key, (value, _) = next(iter(changed.items()))
-        raise ConfigError(
-            f"{key} is {value}, but {by} has no use for it; it reads {', '.join(sorted(used))}"
-        )
 
 
 def differing(in_force: Mapping[str, Any], settings: Settings) -> dict[str, tuple[Any, Any]]:

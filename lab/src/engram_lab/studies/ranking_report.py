@@ -41,6 +41,7 @@ from engram_lab.studies.configurations import (
 )
 from engram_lab.studies.drives import Fold
 from engram_lab.studies.in_force import (
+    OF_DRIVE,
     VARIED,
     Values,
     columns,
@@ -768,8 +769,8 @@ def _draw_costs(out: Path, campaign: CampaignResult, own: Sequence[Row]) -> list
 # the oracle.
 _NEGLIGIBLE = 0.005
 _BEST_KNOWN = "recall"
-# Tables of the settings that make maps and localise held-out drives.
-_USED = {one.name for one in fields(Settings)} | {"drive"}
+# Tables and settings that make maps and localise held-out drives.
+_USED = {one.name for one in fields(Settings)} | set(OF_DRIVE)
 # So many map sizes are shown, evenly over those that there are.
 _SHOWN_SIZES = 8
 _NO_TRUTH = (

@@ -53,7 +53,7 @@ from engram_lab.studies.fleet.steps import (
     runs_path,
     stages_path,
 )
-from engram_lab.studies.in_force import Values, common, exceptions, in_words, unused
+from engram_lab.studies.in_force import OF_DRIVE, Values, common, exceptions, in_words, unused
 from engram_lab.studies.in_force import rows as in_force_rows
 from engram_lab.studies.lockstep import read_runs
 from engram_lab.studies.plan import (
@@ -299,9 +299,12 @@ class FoldResult:
             yield MergeRecord(**read_json(path)).in_force
 
     def downloads_in_force(self) -> Iterator[Values]:
-        """Of each download, for a foray or a held-out drive."""
+        """Of each download for a foray."""
         for path in self._folder.glob("*.download.json"):
             yield DownloadRecord(**read_json(path)).in_force
+
+    def trials_in_force(self) -> Iterator[Values]:
+        """Of each download tried out on a held-out drive."""
         for one in chain.from_iterable(self.trials().values()):
             yield one[1].in_force
 
@@ -360,6 +363,7 @@ class ArmResult:
             "maps": [one for fold in self.folds for one in fold.maps_in_force()],
             "merges": [one for fold in self.folds for one in fold.merges_in_force()],
             "downloads": [one for fold in self.folds for one in fold.downloads_in_force()],
+            "downloads tried": [one for fold in self.folds for one in fold.trials_in_force()],
             "held out": [one for fold in self.folds for one in fold.drives_in_force()],
             "orders": [one for fold in self.folds for one in fold.orders_in_force()],
         }
@@ -1020,8 +1024,8 @@ _SHOWN = {
     },
     "orders": {"build.max_gap_m": "judged at m", "build.estimator": "over"},
 }
-# Tables of the settings that the study reads.
-_USED = {one.name for one in fields(Settings)} | set(VERBS)
+# Tables and settings that the study reads.
+_USED = {one.name for one in fields(Settings)} | {*VERBS, *OF_DRIVE} - {"drive"}
 _COLUMNS = {
     "arm": "arm",
     "map": "map",
