@@ -30,6 +30,7 @@ from engram_lab.studies.evidence import (
     run_study,
     words_of,
 )
+from engram_lab.studies.page_pictures import POLICIES, content_of, order_by_policy
 
 __all__ = ["engram"]
 
@@ -215,8 +216,8 @@ def test_every_block_is_in_a_page() -> None:
 
 
 def test_pictures_are_drawn_from_the_tables_that_are_kept() -> None:
-    for name, (table, _) in pages.pictures(ROOT / pages.TABLES).items():
-        assert pages.source_of(ROOT / pages.PICTURES / f"{name}.png") == pages.content_of(table), (
+    for name, picture in pages.pictures(ROOT / pages.TABLES).items():
+        assert pages.source_of(ROOT / pages.PICTURES / f"{name}.png") == picture.source, (
             f"{name}: run python -m engram_lab.studies.pages draw"
         )
 
@@ -245,9 +246,23 @@ def test_a_changed_table_changes_its_picture(checkout: Path) -> None:
     head, first, *rows = table.read_text().splitlines(keepends=True)
     table.write_text("".join([head, *rows, first]))
     picture = checkout / pages.PICTURES / "papers_merge.png"
-    assert pages.source_of(picture) != pages.content_of(table)
+    assert pages.source_of(picture) != content_of(table)
     pages.draw(checkout)
-    assert pages.source_of(picture) == pages.content_of(table)
+    assert pages.source_of(picture) == content_of(table)
+
+
+def test_a_picture_that_is_not_there_is_drawn(checkout: Path) -> None:
+    drawn = checkout / pages.PICTURES / "ranking.png"
+    drawn.unlink()
+    pages.draw(checkout)
+    assert pages.source_of(drawn) == pages.pictures(checkout / pages.TABLES)["ranking"].source
+
+
+def test_the_made_road_shows_what_the_page_of_ranking_says() -> None:
+    first = {policy: [one.drive for one in order_by_policy(policy)[:3]] for policy in POLICIES}
+    assert first["distance"][0] == "in the sun"  # which failed twice
+    assert set(first["path"]) == {"in rain"}
+    assert first["recall"][:2] == ["in rain", "at night"]
 
 
 def test_an_older_version_is_said_and_is_not_released(checkout: Path, monkeypatch) -> None:

@@ -12,7 +12,6 @@ Figures that are still copied by hand stand below ``<!-- by hand: STUDY, … -->
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 import re
 import shutil
@@ -28,14 +27,15 @@ from engram.errors import InputError
 from engram_lab.intervals import Interval, Resamples, SessionSums, difference
 from engram_lab.studies.budgets import in_short
 from engram_lab.studies.evidence import MANIFEST, STUDIES, State, read_manifest
-from engram_lab.studies.paper_figures import Row, pictures, pooled, read, sessions_of
+from engram_lab.studies.page_pictures import pictures
+from engram_lab.studies.paper_figures import Row, pooled, read, sessions_of
 from engram_lab.studies.year import quarters
 
 # Below the root of a checkout.
 TABLES, PICTURES = "lab/reports/tables", "docs/pictures"
 _BLOCK = re.compile(r"(<!-- drawn: ([\w-]+) -->\n).*?(<!-- /drawn -->)", re.DOTALL)
 _BY_HAND = re.compile(r"<!-- by hand: ([\w, -]+?) -->")
-# Under this key a picture remembers the table that it was drawn from.
+# Under this key a picture remembers what it was drawn from.
 _SOURCE = "Source"
 
 
@@ -142,10 +142,10 @@ def eyes(tables: Path) -> Iterator[str]:
     yield f"| --- |{' --- |' * (len(_SEEN) + 2)}"
     for kind in ("brief", "net"):
         seen = [value(kind, "towns 1, 4", what) for what in _SEEN]
-        cells = [f"{one['value']} of {one['of']}" for one in seen]
+        cells = [one["value"] for one in seen]
         wrong = value(kind, "towns 207, 208", visits)
         time = value(kind, "v4", "600 corners described, ms added to a frame")
-        cells += [f"{wrong['wrong']} of {wrong['of']}", f"{float(time['value']):.1f} ms"]
+        cells += [wrong["wrong"], f"{float(time['value']):.1f} ms"]
         yield f"| `{kind}` | {' | '.join(cells)} |"
 
 
@@ -462,11 +462,6 @@ def by_hand(root: Path) -> dict[Path, list[str]]:
     return found
 
 
-def content_of(table: Path) -> str:
-    """What a picture remembers of its table."""
-    return hashlib.sha256(table.read_bytes()).hexdigest()[:16]
-
-
 def draw(root: Path) -> None:
     """Writes the blocks and the pictures of a checkout again from its tables."""
     tables = root / TABLES
@@ -475,14 +470,16 @@ def draw(root: Path) -> None:
         after = redrawn(before, tables)
         if after != before:
             path.write_text(after, encoding="utf-8")
-    for name, (table, figure) in pictures(tables).items():
+    for name, picture in pictures(tables).items():
         target = root / PICTURES / f"{name}.png"
-        if source_of(target) != content_of(table):
-            figure.savefig(target, dpi=110, metadata={_SOURCE: content_of(table)})
+        if source_of(target) != picture.source:
+            picture.draw().savefig(target, dpi=110, metadata={_SOURCE: picture.source})
 
 
 def source_of(picture: Path) -> str:
-    """The table that a picture was drawn from; empty where it does not say."""
+    """Digest of what a picture was drawn from; empty where it does not say, or is not there."""
+    if not picture.exists():
+        return ""
     said = re.search(rb"tEXt" + _SOURCE.encode() + rb"\0([0-9a-f]{16})", picture.read_bytes())
     return "" if said is None else said[1].decode()
 

@@ -1,13 +1,13 @@
 """The four pictures of docs/papers.md, from the tables of the studies.
 
 At most four curves each, a logarithmic axis where ratios matter, intervals (90 %) as bars.
-`engram_lab.studies.pages` writes them.
+`engram_lab.studies.page_pictures` lists them.
 """
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -163,16 +163,11 @@ def _ended(figure: Figure, axes: Axes, *, logarithmic: bool) -> Figure:
     return figure
 
 
-def pictures(tables: Path) -> dict[str, tuple[Path, Figure]]:
-    """Each picture by name, with the table that it is drawn from; none of what was not measured."""
-    # With a front-end as weak as the papers'; with today's nothing fails that a curve could show.
-    starved, fleet = tables / "starved/summary.csv", tables / "fleet/sessions.csv"
-    drawn = {
-        "papers_lanes": (starved, lanes),
-        "papers_growth": (starved, growth),
-        "papers_merge": (fleet, merging),
-        "papers_downloads": (fleet, downloads),
-    }
-    return {
-        name: (table, draw(read(table))) for name, (table, draw) in drawn.items() if table.exists()
-    }
+# Each picture by name: its table, and what draws it. With a front-end as weak as the papers';
+# with today's nothing fails that a curve could show.
+DRAWN: Mapping[str, tuple[str, Callable[[Sequence[Row]], Figure]]] = {
+    "papers_lanes": ("starved/summary.csv", lanes),
+    "papers_growth": ("starved/summary.csv", growth),
+    "papers_merge": ("fleet/sessions.csv", merging),
+    "papers_downloads": ("fleet/sessions.csv", downloads),
+}
