@@ -1,9 +1,10 @@
-"""Curves with confidence bands, side by side: how results are shown."""
+"""Curves with confidence bands or bars, side by side: how results are shown."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -11,15 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.viewing.drawings import save, subplots
+from engram.viewing.drawings import PALETTE, save, subplots
 
 Array = NDArray[np.float64]
 
-# Matplotlib's ten and black, then other line styles.
-_COLOURS = (*(f"C{number}" for number in range(10)), "black")
+# Those that everybody tells apart, two of Matplotlib's and black, then other line styles.
+COLOURS = (*PALETTE, "C5", "C7", "black")
 _STYLES = ("-", "--", ":")
-_LOOKS = tuple((colour, style) for style in _STYLES for colour in _COLOURS)
+_LOOKS = tuple((colour, style) for style in _STYLES for colour in COLOURS)
+_MARKERS = "os^Dv<>pP*X"
 _PANELS_IN_A_ROW = 4
+# Points of one abscissa stand beside each other, over this share of the axis at most.
+_ASIDE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,7 +32,8 @@ class Line:
 
     Attributes:
         x, y: (N,) float64.
-        low, high: (N,) float64, ends of a confidence band; None for none.
+        low, high: (N,) float64, ends of confidence intervals; None for none.
+        marks: whether each point counts, and has its interval as a bar; else they make a band.
     """
 
     label: str
@@ -84,9 +89,12 @@ def draw_curves(
     figure, axes = subplots(len(panels), width=width, height=4.2 * rows, rows=rows)
     look_of = _looks(panels, looks)
     handles: dict[str, Any] = {}
+    markers = dict(zip(look_of, cycle(_MARKERS), strict=False))
     for one, panel in zip(axes, panels, strict=True):
-        for line in panel.lines:
-            handle = _draw_line(one, line, *look_of[line.label], min(0.08, 0.4 / len(panel.lines)))
+        for line, aside in zip(panel.lines, _asides(panel.lines), strict=True):
+            if not line.marks:
+                _draw_band(one, line, look_of[line.label][0], min(0.08, 0.4 / len(panel.lines)))
+            handle = _draw_line(one, line, *look_of[line.label], markers[line.label], aside)
             handles.setdefault(line.label, handle)
         _draw_axes(one, panel)
     figure.legend(list(handles.values()), list(handles), loc="outside right center", fontsize=8)
@@ -94,18 +102,33 @@ def draw_curves(
     save(figure, path)
 
 
-def _draw_line(axes: Any, line: Line, colour: str, style: str, band: float) -> Any:
-    """With its band, as opaque as given; returns what the legend shows."""
+def _asides(lines: Sequence[Line]) -> Array:
+    """(N,) float64: how far the points of each line stand aside, so that none hide."""
+    marked = np.array([line.marks for line in lines])
+    span = np.ptp(np.concatenate([line.x for line in lines]))
+    places = np.cumsum(marked) - (marked.sum() + 1) / 2
+    step = min(_ASIDE / max(marked.sum() - 1, 1), 0.012) * span
+    return np.asarray(np.where(marked, step * places, 0.0))
+
+
+def _draw_band(axes: Any, line: Line, colour: str, opacity: float) -> None:
     if line.low is not None and line.high is not None:
-        axes.fill_between(line.x, line.low, line.high, color=colour, alpha=band, linewidth=0)
+        axes.fill_between(line.x, line.low, line.high, color=colour, alpha=opacity, linewidth=0)
         for edge in (line.low, line.high):  # bands of many lines hide each other, edges do not
             axes.plot(line.x, edge, color=colour, alpha=0.25, linewidth=0.5)
-    marker = "o" if line.marks else None
-    end = len(line.x) - 1 if line.loose_end else len(line.x)
-    drawn = {"color": colour, "marker": marker, "markersize": 3, "linewidth": 1.3}
-    (handle,) = axes.plot(line.x[:end], line.y[:end], style, **drawn)
+
+
+def _draw_line(axes: Any, line: Line, colour: str, style: str, marker: str, aside: float) -> Any:
+    """Returns what the legend shows."""
+    x = line.x + aside
+    if line.marks and line.low is not None and line.high is not None:
+        axes.vlines(x, line.low, line.high, color=colour, alpha=0.6, linewidth=1)
+    end = len(x) - 1 if line.loose_end else len(x)
+    drawn = {"color": colour, "markersize": 4, "linewidth": 1.3}
+    drawn["marker"] = marker if line.marks else None
+    (handle,) = axes.plot(x[:end], line.y[:end], style, **drawn)
     if line.loose_end:
-        axes.plot(line.x[-2:], line.y[-2:], ":", **drawn)
+        axes.plot(x[-2:], line.y[-2:], ":", **drawn)
     return handle
 
 

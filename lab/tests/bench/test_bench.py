@@ -20,7 +20,7 @@ from engram_lab.bench.runner import run_bench
 from engram_lab.bench.stage import BenchReport, Machine, Side, StageResult, load_plain_pipeline
 from engram_lab.bench.stages import STAGES, prepare_attempt, prepare_frontend_odometry
 from engram_lab.bench.synthetic import SyntheticPlace
-from engram_lab.charts import Line, Panel, draw_curves
+from engram_lab.charts import COLOURS, Line, Panel, draw_curves
 
 STEP_M = 0.8
 
@@ -223,14 +223,10 @@ def legend_of(
 def test_labels_without_a_look_take_what_the_picture_has_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    looks = {"a": ("C1", "-"), "b": ("C0", "-"), "absent": ("C2", "-")}
+    first, second, third, fourth = ((one, "-") for one in COLOURS[:4])
+    looks = {"a": second, "b": first, "absent": third}
     shown = legend_of(monkeypatch, ["new", "b", "a", "newer"], looks)
-    assert shown == {
-        "a": ("C1", "-"),
-        "b": ("C0", "-"),
-        "new": ("C2", "-"),
-        "newer": ("C3", "-"),
-    }
+    assert shown == {"a": second, "b": first, "new": third, "newer": fourth}
 
 
 def test_many_labels_get_other_line_styles_and_begin_again(

@@ -18,7 +18,7 @@ from engram.errors import InputError
 from engram.measures import FORMULAS, Drive, Estimator, failure_sums, longest_gap_m
 from engram.robot.settings import Settings
 from engram_lab.accuracy import PoseErrors
-from engram_lab.charts import Line, Panel, draw_bars, draw_curves
+from engram_lab.charts import COLOURS, Line, Panel, draw_bars, draw_curves
 from engram_lab.intervals import (
     Interval,
     Resamples,
@@ -597,19 +597,16 @@ def rows_by_size(campaign: CampaignResult, own: Sequence[Row]) -> list[Row]:
 # Unlimited lanes stand one step behind the last number.
 _BEYOND = 20.0
 # A policy has one colour in all figures, whichever others are drawn beside it.
-POLICY_COLOURS = {
-    "distance": "C0",
-    "path-near": "C1",
-    "path": "C2",
-    "random": "C3",
-    "oracle": "C4",
-    "time-of-day": "C5",
-    "bag-of-words": "C6",
-    "collaborative": "C7",
-    "nearest-of-each": "C8",
-    "bandit": "C9",
-    "recall": "black",
-}
+POLICY_COLOURS = dict(
+    zip(
+        (
+            "distance", "path-near", "path", "random", "oracle", "time-of-day", "bag-of-words",
+            "collaborative", "nearest-of-each", "bandit", "recall",
+        ),
+        COLOURS,
+        strict=True,
+    )
+)  # fmt: skip
 _LOOKS = {policy: (colour, "-") for policy, colour in POLICY_COLOURS.items()} | {
     Configuration("path-near", paths=kinds).label: (POLICY_COLOURS["path-near"], "--")
     for kinds in PathKinds
@@ -704,7 +701,7 @@ def _lanes(campaign: CampaignResult, own: Sequence[Row], column: str, label: str
     places = sorted({float(x) for line in lines for x in line.x})
     ticks = [(x, "∞" if x == _BEYOND else f"{x:.0f}") for x in places]
     signed = column == "minus_distance"
-    return Panel(campaign.name, "Np", label, lines, ticks, signed=signed)
+    return Panel(campaign.name, "lanes, Np", label, lines, ticks, signed=signed)
 
 
 def _place(lanes: str) -> float:
