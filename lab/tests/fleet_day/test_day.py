@@ -16,12 +16,14 @@ from engram.errors import EngramError
 from engram.fleet.agent.agent import MAP
 from engram.fleet.agent.centre_link import enrol
 from engram.fleet.centre.access import new_code
+from engram.fleet.centre.fleet import robots_of
 from engram.fleet.centre.service import Centre, MapPolicy
 from engram.fleet.merge.merge_settings import MergeOptions
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.monitor import QUIET
 from engram_lab.fleet_day.day import CuttingProxy, DayRobot, Stages, cutting, listening, run_day
+from engram_lab.fleet_day.screens import chromium, take
 
 COPY = {"select": "copy"}
 
@@ -131,6 +133,18 @@ def test_stages_are_told_as_they_begin_and_end() -> None:
         assert told == ["merge …"]
     assert told[1].startswith("merge: ")
     assert list(stages.took) == ["merge"]
+
+
+def test_pages_are_taken_of_a_copy_of_the_days_centre(town: Town, tmp_path: Path) -> None:
+    pytest.importorskip("playwright.sync_api", reason="no Playwright: make test-services")
+    if chromium() is None:
+        pytest.skip("no Chromium on this machine")
+    for name, start_ns in (("r1", 1_000), ("r2", 2_000)):
+        town.robot(name, start_ns).hand_in("first")
+    taken = take(tmp_path, tmp_path)
+    assert [one.name for one in taken] == ["centre_map.jpg", "centre_robots.png"]
+    assert min(one.stat().st_size for one in taken) > 10_000
+    assert {one.follows for one in robots_of(town.centre, "fleet")} == {"head"}
 
 
 @pytest.mark.long

@@ -312,7 +312,7 @@ class Stages(Relay):
         self._tell(f"{what}: {self.took[what]:.1f} s")
 
 
-_CAMPAIGN, _MAP = "hamlet", "fleet"
+_CAMPAIGN, MAP_NAME = "hamlet", "fleet"
 _CUT_BYTES = 200_000
 # Open requests at the end of the day are not waited for any longer.
 _FAREWELL_S = 5
@@ -375,12 +375,12 @@ def run_day(
     for name in ("centre", "robots"):
         shutil.rmtree(out / name, ignore_errors=True)
     with Centre(out / "centre") as centre:
-        centre.add_map(_MAP, "demo")
-        report.token = add_person(centre, "demo", _MAP, Role.ADMIN)
+        centre.add_map(MAP_NAME, "demo")
+        report.token = add_person(centre, "demo", MAP_NAME, Role.ADMIN)
         robots = [DayRobot(out / "robots" / name, centre, stages) for name in _ROBOTS]
         with listening(centre) as port, cutting(port, _CUT_BYTES) as link:
             for robot in robots:
-                code = new_code(centre, _MAP, "head", "demo")
+                code = new_code(centre, MAP_NAME, "head", "demo")
                 enrol(
                     out / "robots" / robot.name, f"http://127.0.0.1:{link.port}", code, robot.name
                 )
@@ -395,7 +395,7 @@ def run_day(
                 plan = _ROBOTS[robot.name]
                 report.forays.append(robot.second_foray(logs[plan.second], plan))
             report.cuts, report.passed_bytes = link.cuts, link.passed_bytes
-        _look_over(report, centre.map_path(_MAP), [robot.live for robot in robots], stages)
+        _look_over(report, centre.map_path(MAP_NAME), [robot.live for robot in robots], stages)
     return report
 
 
