@@ -43,6 +43,18 @@ def test_text_names_terms_and_outcomes(engram, street: Path, mapped_street: Path
     assert "matched," in ran.out
 
 
+def test_a_match_refused_as_a_lookalike_is_told(
+    engram, street: Path, mapped_street: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = ("localise", mapped_street, street, "--explain", 6)
+    assert engram(*asked, "--json").json["refused"] is False
+    monkeypatch.setattr("engram.localiser.yardstick.Likeness.alike", lambda _: 3.0)
+    found = engram(*asked, "--json").json
+    assert found["refused"] is True
+    assert found["status"] != "localised"
+    assert "street of equal fronts" in engram(*asked).out
+
+
 def test_a_frame_without_candidates_is_told_as_such(
     engram, street: Path, mapped_street: Path
 ) -> None:

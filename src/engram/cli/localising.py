@@ -245,6 +245,11 @@ def _explained_text(found: Explanation) -> str:
         f"{sum(one.would_match for one in found.candidates)} would match; "
         f"ordered by {found.ranking}"
     ]
+    if found.refused:
+        lines.append(
+            "  refused: the frame matches, but the matches of the last metres show less than is "
+            "usual here, as a street of equal fronts would; so do rebuilt fronts, and a van ahead"
+        )
     if not found.candidates:
         return "\n".join([*lines, "nothing to rank: the robot is lost, or the frame is unusable"])
     lines += [f"  order: {found.rule}"] if found.rule else []

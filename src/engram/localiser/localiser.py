@@ -630,6 +630,11 @@ class Localiser:
         return self._fixes.contradicted
 
     @property
+    def refuses_lookalikes(self) -> bool:
+        """Whether the last frame matched, but its run of matches may be one of look-alikes."""
+        return self._fixes.lookalike is not None
+
+    @property
     def on_trial(self) -> bool:
         """Whether the last fixes may still be withdrawn: no edge should rest on them yet."""
         return self._fixes.on_trial

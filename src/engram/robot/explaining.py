@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from engram.ranking.context import Foreseen, RankingContext, RankingPolicy, Reas
 from engram.ranking.policies import check_for_robot, policy_named
 from engram.robot.front import arriving
 from engram.robot.localisers import DriveSequence
+from engram.robot.robot import LastFrame
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_on
 
@@ -113,6 +114,8 @@ class Explanation:
         meaning: description of each term, one line each.
         rule: how the terms give the order; empty if the policy's name says it.
         candidates: best first; empty if the robot had no position or the frame was unusable.
+        refused: whether it matched, but is not localised: its run of matches may be one of
+            look-alikes (`engram.localiser.yardstick`).
     """
 
     frame: int
@@ -122,6 +125,7 @@ class Explanation:
     meaning: dict[str, str] = field(default_factory=dict)
     rule: str = ""
     candidates: tuple[ExplainedCandidate, ...] = ()
+    refused: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """What ``explain --json`` prints."""
@@ -132,6 +136,7 @@ class Explanation:
             "status": self.status.value,
             "meaning": self.meaning,
             "rule": self.rule,
+            "refused": self.refused,
             "candidates": [candidate.to_dict() for candidate in self.candidates],
         }
 
@@ -178,8 +183,8 @@ def explain_frame(
             result = robot.step(arrived)
             if number == options.frame:
                 assert robot.last is not None
-                attempted = {outcome.candidate.index for outcome in robot.last.outcomes}
-                return _explained(opened, options, result, watching, attempted)
+                found = _explained(opened, options, result, watching, robot.last)
+                return replace(found, refused=robot.last.refused)
     raise ConfigError(f"the drive has no frame {options.frame}; it has {len(sequence)}")
 
 
@@ -188,11 +193,12 @@ def _explained(
     options: ExplainOptions,
     result: Localisation,
     watching: _Watching,
-    attempted: set[int],
+    last: LastFrame,
 ) -> Explanation:
     if watching.asked is None:
         return Explanation(options.frame, result.stamp_ns, options.ranking, result.status)
     context, order, reasons, foreseen = watching.asked
+    attempted = {outcome.candidate.index for outcome in last.outcomes}
     near, rates = context.neighbourhood, context.success_rates()
     drives = _drives(opened)
     candidates = []

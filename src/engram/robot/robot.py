@@ -55,11 +55,13 @@ class LastFrame:
         arrived: the images, or the logged frame.
         frame: the frame extracted from them.
         outcomes: outcomes of the attempts, in ranked order.
+        refused: whether it matched, but its run of matches may be one of look-alikes.
     """
 
     arrived: Arrived
     frame: Frame
     outcomes: list[Outcome]
+    refused: bool = False
 
 
 class Robot:
@@ -229,7 +231,9 @@ class Robot:
             if self._front.fixed_share:
                 result = replace(result, fixed_share=self._front.fixed_share)
             self._front.match_again(frame, self._localiser.best_matched)
-            self.last = LastFrame(arrived, frame, self._localiser.outcomes)
+            self.last = LastFrame(
+                arrived, frame, self._localiser.outcomes, self._localiser.refuses_lookalikes
+            )
             if self.watch is not None:
                 self.watch(self.last, result)
             if self.recorder is not None:
