@@ -178,7 +178,8 @@ STUDIES: Mapping[str, Study] = {
     "budgets": Study(
         (
             f"engram lab simulate begbroke24h --sessions {_FIRST_25}",
-            f"{_EVALUATE}budgets begbroke24h --first 25 --only-folds 0 --out {{out}}",
+            f"{_EVALUATE}budgets begbroke24h --first 25 --only-folds 0,1 --policies distance,recall "
+            "--sizes 2,5,10 --attempts 1,2,4 --out {out}",
         ),
         60,
         ("sessions.csv", "cells.csv", "times.csv", "configuration.json"),
