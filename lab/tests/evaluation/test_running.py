@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lab.tests.evaluation.campaigns import few_options, write_campaign
+from lab.tests.evaluation.campaigns import LOOKS, few_options, write_campaign
 from tests.builders import World, drive
 from tests.maps import maps
 from tests.sequences.test_framelog import write_ranked
@@ -28,13 +28,15 @@ from engram.frontend.matching import MatcherConfig
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import NodeId, SessionId, node_id
 from engram.localiser.attempts import Lanes
+from engram.localiser.localisation import Localisation, LocalisationStatus
 from engram.maps.map import open_map
 from engram.monitor import QUIET
+from engram.odometry.motion import Motion
 from engram.robot.settings import RobotOptions, Settings
 from engram.sequences.framelog.reader import FrameLog
 from engram_lab.studies import building, running
 from engram_lab.studies.building import build_map, true_nodes
-from engram_lab.studies.configurations import EVERYTHING, UNLIMITED, Configuration, sweep
+from engram_lab.studies.configurations import BY_TRUTH, EVERYTHING, UNLIMITED, Configuration, sweep
 from engram_lab.studies.drives import (
     DriveSet,
     KeptMaps,
@@ -44,8 +46,9 @@ from engram_lab.studies.drives import (
     seen_by,
     split,
 )
+from engram_lab.studies.fleet.plan import FleetOptions
 from engram_lab.studies.in_force import check_logs
-from engram_lab.studies.lockstep import MatchMemo, read_runs
+from engram_lab.studies.lockstep import MatchMemo, Placing, Situation, read_runs
 from engram_lab.studies.plan import Task, alone_in, run_tasks
 from engram_lab.studies.ranking_report import write_report
 from engram_lab.studies.running import Plan, forget, make_plan, run
@@ -487,6 +490,41 @@ def test_a_drive_starts_where_the_map_hangs_together(two_drives: DriveSet, tmp_p
     pose = nodes.pose(cut.node)
     assert pose is not None
     np.testing.assert_allclose((pose @ cut.node_from_live).translation, there.translation)
+
+
+def test_a_lost_robot_is_set_down_where_it_truly_is(two_drives: DriveSet, tmp_path: Path) -> None:
+    build_map(tmp_path / "town.engram", two_drives.drives[:1], Settings(), OPTIONS)
+    drive = two_drives.drives[1]
+    frames, truth = drive.frames(), drive.truth()
+    live, motion = frames[3].frame, Motion(frames[3].odometry)
+    lost = Localisation(live.stamp_ns, LocalisationStatus.LOST, 0, 0, 0.0, motion)
+    with open_map(tmp_path / "town.engram") as opened:
+        nodes = true_nodes(opened, two_drives.drives[:1])
+        situation = Situation(opened, drive, frames, None, nodes, truth)
+        placing, other = (Placing(situation, again=again) for again in (True, False))
+        assert placing.hint(live, motion) is None
+        for one in (placing, other):
+            one.keep(live, lost)
+        hint = placing.hint(live, motion)
+        assert hint is not None
+        assert hint.position is not None
+        node = nodes.pose(hint.position.node)
+        there = truth.at(live.stamp_ns)
+        np.testing.assert_allclose(
+            (node @ hint.position.node_from_live).matrix(), there.matrix(), atol=1e-12
+        )
+        assert other.hint(live, motion) is None
+        placing.keep(live, replace(lost, status=LocalisationStatus.LOCALISED))
+        assert placing.hint(live, motion) is None
+
+
+def test_truth_finds_the_lost_of_ranking_studies_alone(tmp_path: Path) -> None:
+    campaign = write_campaign(tmp_path / "campaign", LOOKS[:4], truth=False)
+    plan = make_plan(campaign, Settings(), few_options(relocaliser=BY_TRUTH), tmp_path)
+    with pytest.raises(ConfigError, match="its truth is not known"):
+        run(plan)
+    with pytest.raises(ConfigError, match="do not know the truth"):
+        FleetOptions(relocaliser=BY_TRUTH)
 
 
 def test_every_candidate_is_attempted_only_where_something_asks_for_it() -> None:

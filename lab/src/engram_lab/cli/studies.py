@@ -225,7 +225,10 @@ def ranking(
     relocaliser: Annotated[
         str,
         typer.Option(
-            "--relocaliser", metavar="NAME", help="How lost robots are found.", hidden=True
+            "--relocaliser",
+            metavar="NAME",
+            help="How lost robots are found; truth sets them down anew.",
+            hidden=True,
         ),
     ] = "none",
     redo: Annotated[

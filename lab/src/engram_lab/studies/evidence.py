@@ -130,7 +130,7 @@ STUDIES: Mapping[str, Study] = {
         (
             f"engram lab simulate begbroke24h --sessions {_FIRST_25}",
             f"{_EVALUATE}ranking begbroke24h --first 25 --policies {_POLICIES} {_SWEPT} "
-            "--only-folds 0 --out {out}",
+            "--only-folds 0 --relocaliser truth --out {out}",
         ),
         30,
         _STUDIED,
@@ -142,7 +142,7 @@ STUDIES: Mapping[str, Study] = {
         (
             f"engram lab simulate begbroke24h --sessions {_FIRST_25}",
             f"{_EVALUATE}ranking begbroke24h --first 25 --policies {_POLICIES} {_SWEPT} "
-            "--only-folds 0 --config {settings}/starved.toml --out {out}",
+            "--only-folds 0 --config {settings}/starved.toml --relocaliser truth --out {out}",
         ),
         40,
         (*_STUDIED, "maps.csv"),
@@ -178,8 +178,8 @@ STUDIES: Mapping[str, Study] = {
     "budgets": Study(
         (
             f"engram lab simulate begbroke24h --sessions {_FIRST_25}",
-            f"{_EVALUATE}budgets begbroke24h --first 25 --only-folds 0,1 --policies distance,recall "
-            "--sizes 2,5,10 --attempts 1,2,4 --out {out}",
+            f"{_EVALUATE}budgets begbroke24h --first 25 --only-folds 0,1 "
+            "--policies distance,recall --sizes 2,5,10 --attempts 1,2,4 --out {out}",
         ),
         60,
         ("sessions.csv", "cells.csv", "times.csv", "configuration.json"),

@@ -16,6 +16,7 @@ from engram.localiser.settings import METHOD_VERSION
 from engram.odometry.motion import GapFiller
 from engram.robot.robot import Robot
 from engram.robot.settings import Settings
+from engram_lab.studies.configurations import BY_TRUTH
 from engram_lab.studies.drives import DriveSet, EvaluatedDrive
 
 # Settings by key with its tables, "localiser.recent.T", as plain values.
@@ -209,7 +210,7 @@ def check_lost(settings: Settings, relocaliser: str | None) -> None:
     """Refuses bounds of lost robots' attempts where matches are made once for all of them."""
     changed = differing(by_key(settings.localiser, "localiser"), Settings())
     for key in _BOUNDS_OF_THE_LOST:
-        if relocaliser is not None and key in changed:
+        if relocaliser not in (None, BY_TRUTH) and key in changed:
             raise ConfigError(
                 f"{key} is {changed[key][0]}, but a study with the relocaliser {relocaliser} "
                 "matches each pair once, whether lost or not, with all of localiser.matcher: "

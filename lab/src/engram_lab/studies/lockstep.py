@@ -32,7 +32,13 @@ from engram.graph.model import NodeId
 from engram.graph.neighbourhood import Neighbourhood, Search
 from engram.localiser.acceptance import Prediction, Spread
 from engram.localiser.attempts import Candidate, Lanes, Matcher, one_by_one
-from engram.localiser.localisation import Hint, Localisation, Position, ResultSink
+from engram.localiser.localisation import (
+    Hint,
+    Localisation,
+    LocalisationStatus,
+    Position,
+    ResultSink,
+)
 from engram.localiser.localiser import Localiser
 from engram.maps.map import Map
 from engram.odometry.motion import GapFiller, Motion, driven_steps_m
@@ -41,7 +47,7 @@ from engram.robot.localisers import LocaliserParts, localiser_in
 from engram.robot.robot import Robot
 from engram.robot.settings import Settings
 from engram.sequences.sequence import LoggedFrame
-from engram_lab.studies.configurations import EVERYTHING, Configuration
+from engram_lab.studies.configurations import BY_TRUTH, EVERYTHING, Configuration
 from engram_lab.studies.drives import EvaluatedDrive, TrueNodes, Truth
 from engram_lab.studies.in_force import Values, of_localiser
 
@@ -183,7 +189,7 @@ def run_in_step(
 
     Args:
         matcher: makes the matches, unguided; None for the localiser's own, guided ones.
-        relocaliser: one of `relocaliser_names()`; None leaves the lost to what is near.
+        relocaliser: as of `StudyOptions`; None leaves the lost to what is near.
         cost_so_far: seconds spent in making matches; left out of `step_ms`.
         threads: most threads that a robot's lanes share; None for one each.
     """
@@ -201,12 +207,13 @@ def run_in_step(
     parts = LocaliserParts(
         matcher=matcher,
         search=search,
-        relocaliser=relocaliser,
+        relocaliser=None if relocaliser == BY_TRUTH else relocaliser,
         threads=threads,
         live=situation.drive.session.id,
         clock=situation.drive.session,
     )
-    with _robots(situation, configurations, settings, parts) as running:
+    again = relocaliser == BY_TRUTH
+    with _robots(situation, configurations, settings, parts, again=again) as running:
         runs = Runs.empty(
             configurations,
             step_m,
@@ -252,20 +259,41 @@ def _note(
         runs.near_seen[row, number] = len(near & seen)
 
 
-class _Placing(ResultSink):
-    """Supplies where the drive starts, and keeps nothing."""
+class Placing(ResultSink):
+    """Supplies where the drive starts, and keeps nothing.
 
-    def __init__(self, situation: Situation) -> None:
+    Args:
+        again: whether a lost robot is set down where it truly is, seen from the nearest node. Its
+            next frame is then as good as one behind a perfect relocaliser ([L15] §VII-B: after
+            10 m without a match).
+    """
+
+    def __init__(self, situation: Situation, *, again: bool) -> None:
+        self._situation = situation
         self._start = situation.start
+        self._again = again
+        self._lost = False
         if self._start is not None:
             self._stamp_ns = situation.frames[self._start[0]].frame.stamp_ns
 
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
         """See `ResultSink`."""
         del motion
-        if self._start is None or live.stamp_ns != self._stamp_ns:
+        if self._start is not None and live.stamp_ns == self._stamp_ns:
+            return Hint(self._start[1])
+        truth = self._situation.truth
+        if not (self._again and self._lost) or truth is None:
             return None
-        return Hint(self._start[1])
+        world_from_live = truth.at(live.stamp_ns)
+        if world_from_live is None:
+            return None
+        return Hint(self._situation.nodes.start(world_from_live))
+
+    def keep(self, live: Frame, result: Localisation) -> Localisation:
+        """See `ResultSink`."""
+        del live
+        self._lost = result.status is LocalisationStatus.LOST
+        return result
 
 
 class _Judge:
@@ -302,16 +330,19 @@ def _robots(
     configurations: Iterable[Configuration],
     settings: Settings,
     parts: LocaliserParts,
+    *,
+    again: bool,
 ) -> Iterator[list[_Running]]:
     """One per configuration; in one map they share its matches."""
     with ExitStack() as stack:
-        result_sink, running = _Placing(situation), list[_Running]()
+        running = list[_Running]()
         for one in configurations:
             own: LocaliserParts = {**parts, "policy": one.policy, "budget": one.budget}
             asked = _settings_for(settings, one, guided=parts["matcher"] is None)
             localiser = localiser_in(situation.opened, situation.drive.camera, asked, **own)
             # Each has a front of its own, which tells time by the frames that it takes.
-            robot = stack.enter_context(Robot(Front(settings), localiser, result_sink))
+            placing = Placing(situation, again=again)
+            robot = stack.enter_context(Robot(Front(settings), localiser, placing))
             running.append(_Running(robot, localiser))
         yield running
 

@@ -42,6 +42,7 @@ from engram_lab.intervals import (
     product,
 )
 from engram_lab.studies.building import write_json
+from engram_lab.studies.configurations import BY_TRUTH
 from engram_lab.studies.drives import (
     DriveSet,
     EvaluatedDrive,
@@ -360,7 +361,8 @@ class StudyOptions:
     """Options of every study.
 
     Attributes:
-        relocaliser: one of `relocaliser_names()`; None for none.
+        relocaliser: one of `relocaliser_names()`; `BY_TRUTH`, of ranking studies, which sets a lost
+            robot down where it truly is; None for none.
         only_folds: numbers of the folds that are run; empty for all. What is run of the others
             later joins it.
     """
@@ -371,7 +373,7 @@ class StudyOptions:
     only_folds: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.relocaliser is not None:
+        if self.relocaliser not in (None, BY_TRUTH):
             check_relocaliser(self.relocaliser)
         check_only(self.only_folds, self.folds)
 

@@ -31,6 +31,7 @@ from engram_lab.intervals import (
 from engram_lab.policies import STUDIED
 from engram_lab.studies.building import BuiltMap
 from engram_lab.studies.configurations import (
+    BY_TRUTH,
     EVERYTHING,
     PATH_POLICIES,
     UNLIMITED,
@@ -1039,7 +1040,9 @@ def _exceptions(campaign: CampaignResult) -> Iterator[str]:
 def _protocol(campaign: CampaignResult) -> str:
     count = max((len(one.sessions) for one in campaign.memo.values()), default=0)
     driven = max((one.driven_m.sum() for one in campaign.memo.values()), default=0.0)
-    found_again = "no relocalisation" if campaign.relocaliser is None else campaign.relocaliser
+    found_again = {None: "no relocalisation", BY_TRUTH: "the lost set down by truth"}.get(
+        campaign.relocaliser, str(campaign.relocaliser)
+    )
     budget = f"Np = {lanes_text(campaign.few_lanes)}, Nr = {campaign.rounds}, T = {campaign.T}"
     return (
         f"{budget}; {count} held-out sessions, {driven / 1e3:.1f} km, unguided, {found_again}; "

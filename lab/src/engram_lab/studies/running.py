@@ -26,6 +26,7 @@ from engram_lab.studies.building import (
     true_nodes,
 )
 from engram_lab.studies.configurations import (
+    BY_TRUTH,
     DEFAULT_LANES,
     FEW_LANES,
     Configuration,
@@ -66,10 +67,12 @@ def localise_held_out(
 
     Args:
         matcher: makes the matches, unguided; None for the localiser's own, guided ones.
-        relocaliser: one of `relocaliser_names()`; None leaves the lost to what is near.
+        relocaliser: as of `StudyOptions`; None leaves the lost to what is near.
         threads: most threads that a robot's lanes share; None for one each.
     """
     nodes, truth = true_nodes(opened, training), drive.truth()
+    if relocaliser == BY_TRUTH and truth is None:
+        raise ConfigError(f"{drive.name}: its truth is not known, which is to find it where lost")
     first = None if truth is None else truth.at(frames[0].frame.stamp_ns)
     position = None if first is None else nodes.start(first)
     start = None if position is None else (0, position)

@@ -17,7 +17,7 @@ from engram.fleet.merge.merge_settings import NO_RELOCALISER, MergeOptions
 from engram.measures import Drive
 from engram.robot.settings import RobotOptions, Settings
 from engram_lab.studies.building import write_json
-from engram_lab.studies.configurations import UNLIMITED, Configuration
+from engram_lab.studies.configurations import BY_TRUTH, UNLIMITED, Configuration
 from engram_lab.studies.drives import DriveSet, EvaluatedDrive, Fold
 from engram_lab.studies.in_force import Values, check_logs, check_lost
 from engram_lab.studies.plan import StudyOptions, StudyPlan, all_tables, study_folder
@@ -143,6 +143,8 @@ class FleetOptions(StudyOptions):
 
     def __post_init__(self) -> None:
         StudyOptions.__post_init__(self)
+        if self.relocaliser == BY_TRUTH:
+            raise ConfigError(f"relocaliser is {BY_TRUTH}: a fleet's robots do not know the truth")
         for name, given, known in (
             ("arms", self.arms, tuple(ARMS)),
             ("experiments", self.experiments, EXPERIMENTS),
