@@ -15,7 +15,7 @@ from tests.cli.conftest import engram
 
 from engram.cli.app import app
 from engram.errors import ConfigError, InputError
-from engram_lab.studies import evidence, pages
+from engram_lab.studies import evidence, pages, paper_figures
 from engram_lab.studies.evidence import (
     MANIFEST,
     STUDIES,
@@ -312,3 +312,35 @@ def test_a_figure_that_is_missing_is_named(tmp_path: Path) -> None:
     assert found.value("odometry", "rotation") == 1.0
     with pytest.raises(InputError, match="no figure 'drift'"):
         found.value("odometry", "drift")
+
+
+def _swept(policy: str, lanes: str, drives: str, missed: float) -> dict[str, str]:
+    """A pooled row of a ranking study."""
+    of = {
+        "rounds": "1", "T": "10", "radius": "search", "mode": "memo", "fold": "all", "paths": "all",
+        "policy": policy, "lanes": lanes, "map_sessions": drives,
+    }  # fmt: skip
+    shares = {"": missed, "_low": missed / 2, "_high": 2 * missed}
+    return of | {
+        f"{measure}{end}": str(value)
+        for measure in paper_figures.MEASURES
+        for end, value in shares.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("draw", "varies"), [(paper_figures.lanes, "lanes"), (paper_figures.growth, "map_sessions")]
+)
+def test_curves_show_each_policy_in_per_cent_with_none_on_the_axis(draw, varies) -> None:
+    rows = [
+        _swept(policy, "2", "", share) | {"lanes": "2", varies: count}
+        for policy, shares in {"distance": (0.4, 0.1), "recall": (0.04, 0.0)}.items()
+        for count, share in zip(("2", "4"), shares, strict=True)
+    ]
+    figure = draw(rows, rows)
+    assert len(figure.axes) == 4
+    for axes in figure.axes:
+        shown = {one.get_label(): one.lines[0].get_ydata().tolist() for one in axes.containers}
+        assert shown["Γ(distance)"] == pytest.approx([40, 10])
+        assert shown["recall"] == pytest.approx([4, 0])
+        assert axes.get_ylim()[0] < 0

@@ -34,14 +34,14 @@ class Picture:
     draw: Callable[[], Figure]
 
     @staticmethod
-    def of_table(table: Path, draw: Callable[[Sequence[Row]], Figure]) -> Picture:
-        """Drawn from the rows of a table."""
-        return Picture(content_of(table), lambda: draw(read(table)))
+    def of_tables(tables: Sequence[Path], draw: Callable[..., Figure]) -> Picture:
+        """Drawn from the rows of tables."""
+        return Picture(content_of(*tables), lambda: draw(*(read(one) for one in tables)))
 
 
-def content_of(table: Path) -> str:
-    """What a picture remembers of its table."""
-    return _digest(table.read_bytes())
+def content_of(*tables: Path) -> str:
+    """What a picture remembers of its tables."""
+    return _digest(b"".join(one.read_bytes() for one in tables))
 
 
 def _digest(content: bytes) -> str:
@@ -50,14 +50,11 @@ def _digest(content: bytes) -> str:
 
 def pictures(tables: Path) -> dict[str, Picture]:
     """Each picture by name; none of what was not measured."""
-    from_tables = {
-        **{name: (tables / one, draw) for name, (one, draw) in paper_figures.DRAWN.items()},
-        "eyes": (tables / "eyes/eyes.csv", eyes),
-    }
+    drawn = {**paper_figures.DRAWN, "eyes": (("eyes/eyes.csv",), eyes)}
     found = {
-        name: Picture.of_table(table, draw)
-        for name, (table, draw) in from_tables.items()
-        if table.exists()
+        name: Picture.of_tables([tables / one for one in some], draw)
+        for name, (some, draw) in drawn.items()
+        if all((tables / one).exists() for one in some)
     }
     orders = [order_by_policy(policy) for policy in POLICIES]
     return {**found, "ranking": Picture(_digest(repr(orders).encode()), partial(ranking, orders))}

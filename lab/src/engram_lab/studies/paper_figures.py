@@ -9,12 +9,15 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import NullLocator
+from numpy.typing import NDArray
 
+from engram.viewing.drawings import PALETTE
 from engram_lab.intervals import Interval, Resamples, SessionSums
 
 Row = Mapping[str, str]
@@ -24,7 +27,10 @@ LANES = {
     "recall": "recall",
     "oracle": "oracle",
 }
-GROWTH = {"distance": "Γ(distance)", "path": "Γ(path), as published", "recall": "recall"}
+MEASURES = {"p_gt_10m": "P(> 10 m), %", "share_not_localised": "route missed, %"}
+FRONTS = ("Engram's front-end", "100 landmarks and the paper's rules")
+# Below, per cent, an axis is linear, down to none.
+_LINEAR = 0.1
 PARTS = {
     "held out in copy": "everything",
     "held out in budget 1/4": "budget,\n¼ of the bytes",
@@ -32,6 +38,7 @@ PARTS = {
     "held out in tod+paths": "by hour\nand path",
 }
 MERGED = {"single": "one agent", "4 groups": "four, merged"}
+_MARKERS = "os^D"
 # Each curve stands so much farther right than the one before.
 _ASIDE = 1.025
 ARMS = {"A": "Γ(distance)", "B": "recall"}
@@ -90,30 +97,42 @@ def curve(
         np.array([100 * float(one[f"{measure}{end}"]) for one in rows])
         for end in ("", "_low", "_high")
     )
-    axes.errorbar(x, y, [y - low, high - y], marker="o", markersize=3, capsize=2, label=label)
+    axes.errorbar(
+        x,
+        y,
+        [y - low, high - y],
+        color=PALETTE[place],
+        marker=_MARKERS[place],
+        markersize=4,
+        capsize=2,
+        label=label,
+    )
 
 
-def lanes(rows: Sequence[Row]) -> Figure:
-    """Route missed against the number of lanes ([L15] Fig. 11)."""
-    figure, axes = _axes("lanes, Np", "route missed, %")
-    usual = [one for one in pooled(rows) if not one["map_sessions"] and one["lanes"].isdigit()]
-    for place, (policy, label) in enumerate(LANES.items()):
-        own = [one for one in usual if one["policy"] == policy]
-        curve(axes, own, "lanes", "share_not_localised", label, place=place)
-    _doubling(axes, (1, 2, 4, 8))
-    return _ended(figure, axes, logarithmic=True)
+def lanes(*fronts: Sequence[Row]) -> Figure:
+    """P(> 10 m) and route missed against the number of lanes ([L15] Fig. 11), by front-end."""
+    figure, every = _panels(len(fronts))
+    for rows, column in zip(fronts, every.T, strict=True):
+        usual = [one for one in pooled(rows) if not one["map_sessions"] and one["lanes"].isdigit()]
+        for measure, axes in zip(MEASURES, column, strict=True):
+            for place, (policy, label) in enumerate(LANES.items()):
+                own = [one for one in usual if one["policy"] == policy]
+                curve(axes, own, "lanes", measure, label, place=place)
+            _doubling(axes, (1, 2, 4, 8))
+    return _titled(figure, every, "lanes, Np")
 
 
-def growth(rows: Sequence[Row]) -> Figure:
-    """P(> 10 m) as the map grows, two lanes ([L15] Fig. 9)."""
-    figure, axes = _axes("drives in the map", "P(> 10 m), %")
-    usual = [one for one in pooled(rows) if one["map_sessions"] and one["lanes"] == "2"]
-    steps = {"1", "2", "4", "8", "16", "24"}
-    for place, (policy, label) in enumerate(GROWTH.items()):
-        own = [one for one in usual if one["policy"] == policy and one["map_sessions"] in steps]
-        curve(axes, own, "map_sessions", "p_gt_10m", label, place=place)
-    _doubling(axes, (1, 2, 4, 8, 16, 24))
-    return _ended(figure, axes, logarithmic=True)
+def growth(*fronts: Sequence[Row]) -> Figure:
+    """The same as the map grows, two lanes ([L15] Fig. 9)."""
+    figure, every = _panels(len(fronts))
+    for rows, column in zip(fronts, every.T, strict=True):
+        usual = [one for one in pooled(rows) if one["map_sessions"] and one["lanes"] == "2"]
+        for measure, axes in zip(MEASURES, column, strict=True):
+            for place, (policy, label) in enumerate(LANES.items()):
+                own = [one for one in usual if one["policy"] == policy]
+                curve(axes, own, "map_sessions", measure, label, place=place)
+            _doubling(axes, (1, 2, 4, 8, 16))
+    return _titled(figure, every, "drives in the map")
 
 
 def merging(rows: Sequence[Row]) -> Figure:
@@ -133,10 +152,12 @@ def _compared(rows: Sequence[Row], experiment: str, maps: Mapping[str, str]) -> 
         common = set.intersection(*({one["drive"] for one in each} for each in own.values()))
         for place, name in enumerate(maps):
             found = missed([one for one in own[name] if one["drive"] in common])
-            bars(axes, place + 0.4 * side - 0.2, found, f"C{side}")
-        axes.bar(0, 0, color=f"C{side}", label=label)
+            bars(axes, place + 0.4 * side - 0.2, found, PALETTE[side])
+        axes.bar(0, 0, color=PALETTE[side], label=label)
     axes.set_xticks(range(len(maps)), maps.values())
-    return _ended(figure, axes, logarithmic=False)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8)
+    return figure
 
 
 def _axes(across: str, up: str) -> tuple[Figure, Axes]:
@@ -146,28 +167,44 @@ def _axes(across: str, up: str) -> tuple[Figure, Axes]:
     return figure, axes
 
 
+def _panels(columns: int) -> tuple[Figure, NDArray[Any]]:
+    """A row for each measure, a column for each front-end."""
+    figure = Figure(figsize=(7.2, 5.0), layout="constrained")
+    every = figure.subplots(len(MEASURES), columns, sharex=True, sharey=True, squeeze=False)
+    return figure, every
+
+
+def _titled(figure: Figure, every: NDArray[Any], across: str) -> Figure:
+    """With axes that show both none and all, and what they are."""
+    for axes in every.flat:
+        axes.set_yscale("symlog", linthresh=_LINEAR)
+        axes.set_ylim(-0.015, 130)  # what lies on none is whole
+        axes.set_yticks((0, 0.1, 1, 10, 100), ("0", "0.1", "1", "10", "100"))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.grid(axis="y", alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    for axes, front in zip(every[0], FRONTS, strict=False):
+        axes.set_title(front, fontsize=10)
+    for axes, words in zip(every[:, 0], MEASURES.values(), strict=True):
+        axes.set_ylabel(words)
+    for axes in every[-1]:
+        axes.set_xlabel(across)
+    handles, labels = every[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
+    return figure
+
+
 def _doubling(axes: Axes, ticks: Sequence[int]) -> None:
     axes.set_xscale("log", base=2)
     axes.set_xticks(ticks, [str(one) for one in ticks])
     axes.xaxis.set_minor_locator(NullLocator())
 
 
-def _ended(figure: Figure, axes: Axes, *, logarithmic: bool) -> Figure:
-    if logarithmic:
-        axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.yaxis.set_major_formatter("{x:g}")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8, loc="upper right" if logarithmic else "best")
-    return figure
-
-
-# Each picture by name: its table, and what draws it. With a front-end as weak as the papers';
-# with today's nothing fails that a curve could show.
-DRAWN: Mapping[str, tuple[str, Callable[[Sequence[Row]], Figure]]] = {
-    "papers_lanes": ("starved/summary.csv", lanes),
-    "papers_growth": ("starved/summary.csv", growth),
-    "papers_merge": ("fleet/sessions.csv", merging),
-    "papers_downloads": ("fleet/sessions.csv", downloads),
+_BOTH_FRONTS = ("ranking/summary.csv", "starved/summary.csv")
+# Each picture by name: its tables, and what draws it from their rows.
+DRAWN: Mapping[str, tuple[tuple[str, ...], Callable[..., Figure]]] = {
+    "papers_lanes": (_BOTH_FRONTS, lanes),
+    "papers_growth": (_BOTH_FRONTS, growth),
+    "papers_merge": (("fleet/sessions.csv",), merging),
+    "papers_downloads": (("fleet/sessions.csv",), downloads),
 }
