@@ -141,6 +141,46 @@ def test_what_is_foreseen_is_what_attempts_come_to(town: Path, monkeypatch) -> N
     assert policy.seen[-1][0].accepted.any()
 
 
+class _Noting:
+    """Ranks by distance and keeps the node k that it was given."""
+
+    name = "noting"
+
+    def __init__(self) -> None:
+        self.references = []
+
+    def rank(self, context):
+        self.references.append(context.reference)
+        return POLICIES["distance"]().rank(context)
+
+
+def test_a_robot_is_localised_in_no_node_until_a_match_confirms_where_it_was_set_down(
+    town: Path, monkeypatch
+) -> None:
+    live = drive(TOWN, TOWN_ROAD, seed=1, start_ns=10**15)[:6]
+    policy = _Noting()
+    monkeypatch.setitem(POLICIES, policy.name, lambda: policy)
+    with (
+        Map.open(town) as opened,
+        localiser_in(
+            opened, live[0].frame.camera, Settings(), policy=policy.name, relocaliser=None
+        ) as localiser,
+    ):
+        robot = Robot(Front(Settings()), localiser)
+        localiser.place_at(Position.at(opened.graph.node(0).id))
+        before = [robot.step(seen.logged) for seen in live[:3]]
+        assert policy.references[0] is None
+        for found, k in zip(before, policy.references[1:], strict=False):
+            assert found.node is not None
+            assert k == localiser.graph.index(found.node)
+        localiser.place_at(before[-1].measured, agreed=3)
+        robot.step(live[3].logged)
+        assert policy.references[-1] == localiser.graph.index(before[-1].node)
+        localiser.place_at(before[-1].measured)
+        robot.step(live[4].logged)
+        assert policy.references[-1] is None
+
+
 class _Damaged(Lanes):
     """The landmarks of the map's first node cannot be read."""
 

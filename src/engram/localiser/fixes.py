@@ -457,6 +457,11 @@ class Fixes:
         return self._chain.on_trial or not self._run.proved
 
     @property
+    def told(self) -> bool:
+        """Whether the position was supplied, and no fix and no saved node confirm it yet."""
+        return self._told
+
+    @property
     def doubted(self) -> bool:
         """Whether the position may well be wrong: unconfirmed, or expected fixes are missing."""
         after = self._accepted.doubt_after

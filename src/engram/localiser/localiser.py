@@ -501,7 +501,7 @@ class Localiser:
             path_memory=self._paths,
             basin=self._basin,
             observations=self._history.observations,
-            reference=self._graph.index(self.position.node),
+            reference=None if self._fixes.told else self._graph.index(self.position.node),
             own_path=self._own_path,
             stamp_ns=live.stamp_ns,
             seed=live.stamp_ns,
