@@ -24,7 +24,7 @@ from tests.maps import maps
 from tests.sequences.test_framelog import write_ranked
 
 from engram.errors import ConfigError, MapError, MapLockedError, SequenceError, WorkerError
-from engram.frontend.matching import MatcherConfig
+from engram.frontend.matching import Match, MatcherConfig
 from engram.graph.graph import ExperienceGraph
 from engram.graph.model import NodeId, SessionId, node_id
 from engram.localiser.attempts import Lanes
@@ -48,7 +48,7 @@ from engram_lab.studies.drives import (
 )
 from engram_lab.studies.fleet.plan import FleetOptions
 from engram_lab.studies.in_force import check_logs
-from engram_lab.studies.lockstep import MatchMemo, Placing, Situation, read_runs
+from engram_lab.studies.lockstep import ByTruth, MatchMemo, Placing, Situation, read_runs
 from engram_lab.studies.plan import Task, alone_in, run_tasks
 from engram_lab.studies.ranking_report import write_report
 from engram_lab.studies.running import Plan, forget, make_plan, run
@@ -456,6 +456,18 @@ def two_drives(tmp_path: Path) -> DriveSet:
     return write_campaign(tmp_path / "campaign", (0, 0))
 
 
+class Hiding(Lanes):
+    """Matches as a robot does, but for some nodes."""
+
+    hidden = ()
+
+    def match(self, live, live_id, node, guide):
+        none = np.empty(0, np.int32)
+        if node in self.hidden:
+            return Match(None, None, 0, none, none)
+        return super().match(live, live_id, node, guide)
+
+
 class FakeMap:
     """Nodes of a real map, some of them cut off from the rest."""
 
@@ -492,7 +504,9 @@ def test_a_drive_starts_where_the_map_hangs_together(two_drives: DriveSet, tmp_p
     np.testing.assert_allclose((pose @ cut.node_from_live).translation, there.translation)
 
 
-def test_a_lost_robot_is_set_down_where_it_truly_is(two_drives: DriveSet, tmp_path: Path) -> None:
+def test_a_lost_robot_is_found_at_the_nearest_node_that_matches(
+    two_drives: DriveSet, tmp_path: Path
+) -> None:
     build_map(tmp_path / "town.engram", two_drives.drives[:1], Settings(), OPTIONS)
     drive = two_drives.drives[1]
     frames, truth = drive.frames(), drive.truth()
@@ -501,21 +515,30 @@ def test_a_lost_robot_is_set_down_where_it_truly_is(two_drives: DriveSet, tmp_pa
     with open_map(tmp_path / "town.engram") as opened:
         nodes = true_nodes(opened, two_drives.drives[:1])
         situation = Situation(opened, drive, frames, None, nodes, truth)
-        placing, other = (Placing(situation, again=again) for again in (True, False))
+        config = Settings().localiser
+        matcher = Hiding(opened.frames, config.matcher)
+        relocaliser = ByTruth(situation, matcher, config.acceptance)
+        there = truth.at(live.stamp_ns)
+        matcher.hidden = [one.node for one in nodes.seen_from(there, 8.0)][:2]
+        placing, other = Placing(situation, relocaliser), Placing(situation)
         assert placing.hint(live, motion) is None
         for one in (placing, other):
             one.keep(live, lost)
         hint = placing.hint(live, motion)
         assert hint is not None
         assert hint.position is not None
-        node = nodes.pose(hint.position.node)
-        there = truth.at(live.stamp_ns)
+        assert hint.agreed == 1
+        assert hint.position.node == nodes.seen_from(there, 8.0)[2].node
         np.testing.assert_allclose(
-            (node @ hint.position.node_from_live).matrix(), there.matrix(), atol=1e-12
+            (nodes.pose(hint.position.node) @ hint.position.node_from_live).matrix(),
+            there.matrix(),
+            atol=1e-12,
         )
         assert other.hint(live, motion) is None
         placing.keep(live, replace(lost, status=LocalisationStatus.LOCALISED))
         assert placing.hint(live, motion) is None
+        matcher.hidden = [one.id for one in opened.graph.nodes]
+        assert ByTruth(situation, matcher, config.acceptance).find(live) is None
 
 
 def test_truth_finds_the_lost_of_ranking_studies_alone(tmp_path: Path) -> None:

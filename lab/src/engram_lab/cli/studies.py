@@ -227,7 +227,7 @@ def ranking(
         typer.Option(
             "--relocaliser",
             metavar="NAME",
-            help="How lost robots are found; truth sets them down anew.",
+            help="How lost robots are found; truth finds all that match.",
             hidden=True,
         ),
     ] = "none",

@@ -20,7 +20,7 @@ FEW_LANES = 2
 # Policies whose second round is measured too.
 TWO_ROUNDS = ("distance", "path-near", "recall")
 PATH_POLICIES = ("path-near", "path")
-# A relocaliser that always finds the robot. Without any, the choice at which a drive loses itself
+# A relocaliser that finds whatever matches. Without any, the choice at which a drive loses itself
 # decides the rest of it.
 BY_TRUTH = "truth"
 

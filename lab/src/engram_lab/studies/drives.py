@@ -348,6 +348,14 @@ class TrueNodes:
         apart = ~self._in_main | (distance_m > DEFAULT_RADIUS_M)
         # Nodes that look another way only where there are no others.
         node = self._ids[int(np.lexsort((distance_m, apart, away))[0])]
+        return self._from(node, world_from_live)
+
+    def seen_from(self, world_from_live: SE3, radius_m: float) -> list[Position]:
+        """The position seen from each node of `near`, the nearest first; ties by id."""
+        found = [self._from(node, world_from_live) for node in self.near(world_from_live, radius_m)]
+        return sorted(found, key=lambda one: (one.node_from_live.distance_m, one.node))
+
+    def _from(self, node: NodeId, world_from_live: SE3) -> Position:
         covariance = np.diag([_SIGMA_M**2] * 3 + [_SIGMA_RAD**2] * 3)
         return Position(node, self._poses[node].inverse() @ world_from_live, covariance)
 

@@ -28,9 +28,9 @@ from engram.frontend.frame import Frame
 from engram.frontend.matching import Match, matcher_hash
 from engram.geometry.se3 import SE3
 from engram.graph.basin import DEFAULT_RADIUS_M
-from engram.graph.model import NodeId
+from engram.graph.model import NodeId, node_id
 from engram.graph.neighbourhood import Neighbourhood, Search
-from engram.localiser.acceptance import Prediction, Spread
+from engram.localiser.acceptance import AcceptanceConfig, Prediction, Spread, accept
 from engram.localiser.attempts import Candidate, Lanes, Matcher, one_by_one
 from engram.localiser.localisation import (
     Hint,
@@ -212,8 +212,12 @@ def run_in_step(
         live=situation.drive.session.id,
         clock=situation.drive.session,
     )
-    again = relocaliser == BY_TRUTH
-    with _robots(situation, configurations, settings, parts, again=again) as running:
+    perfect = None
+    if relocaliser == BY_TRUTH:
+        config = settings.localiser
+        made_by = matcher or Lanes(situation.opened.frames, config.matcher)
+        perfect = ByTruth(situation, made_by, config.acceptance)
+    with _robots(situation, configurations, settings, parts, perfect) as running:
         runs = Runs.empty(
             configurations,
             step_m,
@@ -263,15 +267,12 @@ class Placing(ResultSink):
     """Supplies where the drive starts, and keeps nothing.
 
     Args:
-        again: whether a lost robot is set down where it truly is, seen from the nearest node. Its
-            next frame is then as good as one behind a perfect relocaliser ([L15] §VII-B: after
-            10 m without a match).
+        relocaliser: finds the robot at the start and wherever it is lost; None for none.
     """
 
-    def __init__(self, situation: Situation, *, again: bool) -> None:
-        self._situation = situation
+    def __init__(self, situation: Situation, relocaliser: ByTruth | None = None) -> None:
         self._start = situation.start
-        self._again = again
+        self._relocaliser = relocaliser
         self._lost = False
         if self._start is not None:
             self._stamp_ns = situation.frames[self._start[0]].frame.stamp_ns
@@ -279,21 +280,52 @@ class Placing(ResultSink):
     def hint(self, live: Frame, motion: Motion) -> Hint | None:
         """See `ResultSink`."""
         del motion
-        if self._start is not None and live.stamp_ns == self._stamp_ns:
-            return Hint(self._start[1])
-        truth = self._situation.truth
-        if not (self._again and self._lost) or truth is None:
-            return None
-        world_from_live = truth.at(live.stamp_ns)
-        if world_from_live is None:
-            return None
-        return Hint(self._situation.nodes.start(world_from_live))
+        starts = self._start is not None and live.stamp_ns == self._stamp_ns
+        found = None
+        if self._relocaliser is not None and (starts or self._lost):
+            found = self._relocaliser.find(live)
+        if found is not None:
+            return Hint(found, agreed=1)
+        return Hint(self._start[1]) if self._start is not None and starts else None
 
     def keep(self, live: Frame, result: Localisation) -> Localisation:
         """See `ResultSink`."""
         del live
         self._lost = result.status is LocalisationStatus.LOST
         return result
+
+
+class ByTruth:
+    """A relocaliser that finds whatever can be found: the nearest node by truth that matches.
+
+    Stands for [L15] §VII-B's, which after 10 m without a match looks for a place that looks alike.
+    One for all robots of a drive: those that are lost at one frame are found alike.
+    """
+
+    def __init__(self, situation: Situation, matcher: Matcher, config: AcceptanceConfig) -> None:
+        self._situation = situation
+        self._matcher = matcher
+        self._config = config
+        self._found: tuple[int, Position | None] | None = None
+
+    def find(self, live: Frame) -> Position | None:
+        """Where the robot is; None where no node near it matches, or its true pose is unknown."""
+        if self._found is None or self._found[0] != live.stamp_ns:
+            self._found = live.stamp_ns, self._search(live)
+        return self._found[1]
+
+    def _search(self, live: Frame) -> Position | None:
+        truth, session = self._situation.truth, self._situation.drive.session.id
+        world_from_live = None if truth is None else truth.at(live.stamp_ns)
+        if world_from_live is None:
+            return None
+        live_id = node_id(session, live.stamp_ns)
+        for there in self._situation.nodes.seen_from(world_from_live, DEFAULT_RADIUS_M):
+            match = self._matcher.match(live, live_id, there.node, None)
+            expected = Prediction(there.node_from_live, 0.0, 0.0)
+            if accept(match, expected, self._config):
+                return there
+        return None
 
 
 class _Judge:
@@ -330,8 +362,7 @@ def _robots(
     configurations: Iterable[Configuration],
     settings: Settings,
     parts: LocaliserParts,
-    *,
-    again: bool,
+    relocaliser: ByTruth | None,
 ) -> Iterator[list[_Running]]:
     """One per configuration; in one map they share its matches."""
     with ExitStack() as stack:
@@ -341,7 +372,7 @@ def _robots(
             asked = _settings_for(settings, one, guided=parts["matcher"] is None)
             localiser = localiser_in(situation.opened, situation.drive.camera, asked, **own)
             # Each has a front of its own, which tells time by the frames that it takes.
-            placing = Placing(situation, again=again)
+            placing = Placing(situation, relocaliser)
             robot = stack.enter_context(Robot(Front(settings), localiser, placing))
             running.append(_Running(robot, localiser))
         yield running

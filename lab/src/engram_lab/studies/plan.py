@@ -361,8 +361,8 @@ class StudyOptions:
     """Options of every study.
 
     Attributes:
-        relocaliser: one of `relocaliser_names()`; `BY_TRUTH`, of ranking studies, which sets a lost
-            robot down where it truly is; None for none.
+        relocaliser: one of `relocaliser_names()`; `BY_TRUTH`, of ranking studies, which finds
+            all that can be found; None for none.
         only_folds: numbers of the folds that are run; empty for all. What is run of the others
             later joins it.
     """

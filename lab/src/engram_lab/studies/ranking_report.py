@@ -1040,7 +1040,7 @@ def _exceptions(campaign: CampaignResult) -> Iterator[str]:
 def _protocol(campaign: CampaignResult) -> str:
     count = max((len(one.sessions) for one in campaign.memo.values()), default=0)
     driven = max((one.driven_m.sum() for one in campaign.memo.values()), default=0.0)
-    found_again = {None: "no relocalisation", BY_TRUTH: "the lost set down by truth"}.get(
+    found_again = {None: "no relocalisation", BY_TRUTH: "the lost found by truth"}.get(
         campaign.relocaliser, str(campaign.relocaliser)
     )
     budget = f"Np = {lanes_text(campaign.few_lanes)}, Nr = {campaign.rounds}, T = {campaign.T}"
