@@ -188,7 +188,7 @@ REPORTS = Path(__file__).parents[2] / "reports"
 
 
 def test_the_table_that_ships_is_that_of_the_kept_rows():
-    rows = read([REPORTS / "forecast_missions.csv", REPORTS / "tables/fleet/sessions.csv"])
+    rows = read([REPORTS / "forecast_missions.csv", REPORTS / "forecast_fleet.csv"])
     found = classes(rows)
     assert len(found) > 10
     for (weather, alike, few, place), towns in found.items():

@@ -7,7 +7,8 @@
 
 A town is a folder of frame logs. Its drives are mapped one after another; after each, the next five
 are missions: a download for date and hour is made, and the drive is localised there. The fit also
-reads `lab/reports/tables/fleet/sessions.csv`. Towns of the fit are never judged.
+reads `lab/reports/forecast_fleet.csv`: held-out drives of the fleet study in world 5. Towns of the
+fit are never judged.
 """
 
 from __future__ import annotations
