@@ -62,7 +62,7 @@ class RankingContext:
         basin: the live camera's match basin.
         observations: W and z, the recent attempts.
         reference: dense index of the node k in which the robot is or was last localised; None
-            if it was not yet, or was set down since by somebody who may be wrong.
+            if it was not yet, or its position was supplied since, and no match has confirmed it.
         own_path: the live session's path, excluded from Z and N; None if it has none.
         stamp_ns: the live frame's stamp, ns.
         seed: seed for policies that draw at random.

@@ -28,7 +28,7 @@ LANES = {
     "oracle": "oracle",
 }
 MEASURES = {"p_gt_10m": "P(> 10 m), %", "share_not_localised": "route missed, %"}
-FRONTS = ("Engram's front-end", "100 landmarks and the paper's rules")
+FRONTS = ("as Engram is by default", "100 landmarks, the paper's rules")
 # Below, per cent, an axis is linear, down to none.
 _LINEAR = 0.1
 PARTS = {
