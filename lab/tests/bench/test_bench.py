@@ -233,9 +233,9 @@ def test_many_labels_get_other_line_styles_and_begin_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     shown = legend_of(monkeypatch, [f"{k:02d}" for k in range(40)], {})
-    assert shown["10"] == ("black", "-")
-    assert shown["11"] == ("C0", "--")
-    assert shown["33"] == ("C0", "-")
+    assert shown["10"] == (COLOURS[10], "-")
+    assert shown["11"] == (COLOURS[0], "--")
+    assert shown["33"] == (COLOURS[0], "-")
 
 
 def test_a_logarithmic_panel_without_anything_above_its_least_value_is_drawn(
