@@ -241,6 +241,15 @@ def test_a_changed_table_changes_its_page(checkout: Path) -> None:
     assert "| overcast | 50.3 |" in (checkout / "docs/evidence.md").read_text()
 
 
+def test_a_map_that_a_kill_broke_is_told(checkout: Path) -> None:
+    table = checkout / pages.TABLES / "kills/1.txt"
+    first, *rows = table.read_text().splitlines(keepends=True)
+    assert '"good": true' in first
+    table.write_text("".join([first.replace('"good": true', '"good": false'), *rows]))
+    pages.draw(checkout)
+    assert "49 of 50 maps were sound" in (checkout / "docs/evidence.md").read_text()
+
+
 def test_a_changed_table_changes_its_picture(checkout: Path) -> None:
     table = checkout / pages.TABLES / "fleet/sessions.csv"
     head, first, *rows = table.read_text().splitlines(keepends=True)

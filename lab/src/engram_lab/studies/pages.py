@@ -125,6 +125,18 @@ def robot_needs(tables: Path) -> Iterator[str]:
         yield f"| {words} | {' | '.join(f'{one:.1f} ms' for one in times_ms)} |"
 
 
+def kills(tables: Path) -> Iterator[str]:
+    """How many maps outlived a kill of the process that mapped."""
+    lines = (tables / "kills/1.txt").read_text(encoding="utf-8").splitlines()
+    killed = [json.loads(line) for line in lines if line.startswith("{")]
+    good, within = (sum(one[name] for one in killed) for name in ("good", "within_commit"))
+    yield (
+        f"{good} of {len(killed)} maps were sound after `kill -9` amid mapping, {within} of these "
+        "amid a commit, and their drives went on or were closed"
+    )
+    yield "(`python -m engram_lab.checks.kill_mapping`)."
+
+
 # Conditions, as docs/eyes.md has them.
 _SEEN = ("morning / night", "morning / snow", "rain / rain again")
 
@@ -405,6 +417,7 @@ BLOCKS: Mapping[str, Block] = {
     "real-images-in-short": Block("real-images", real_images_in_short),
     "robot-needs": Block("robot-needs", robot_needs),
     "eyes": Block("eyes", eyes),
+    "kills": Block("kills", kills),
     "ranking": Block("ranking", ranking),
     "starved": Block("starved", starved),
     "conditions": Block("conditions", conditions),
