@@ -111,28 +111,34 @@ def curve(
 
 def lanes(*fronts: Sequence[Row]) -> Figure:
     """P(> 10 m) and route missed against the number of lanes ([L15] Fig. 11), by front-end."""
-    figure, every = _panels(len(fronts))
-    for rows, column in zip(fronts, every.T, strict=True):
-        usual = [one for one in pooled(rows) if not one["map_sessions"] and one["lanes"].isdigit()]
-        for measure, axes in zip(MEASURES, column, strict=True):
-            for place, (policy, label) in enumerate(LANES.items()):
-                own = [one for one in usual if one["policy"] == policy]
-                curve(axes, own, "lanes", measure, label, place=place)
-            _doubling(axes, (1, 2, 4, 8))
-    return _titled(figure, every, "lanes, Np")
+    whole = [
+        [one for one in pooled(rows) if not one["map_sessions"] and one["lanes"].isdigit()]
+        for rows in fronts
+    ]
+    return _by_front(whole, "lanes", "lanes, Np", (1, 2, 4, 8))
 
 
 def growth(*fronts: Sequence[Row]) -> Figure:
     """The same as the map grows, two lanes ([L15] Fig. 9)."""
+    grown = [
+        [one for one in pooled(rows) if one["map_sessions"] and one["lanes"] == "2"]
+        for rows in fronts
+    ]
+    return _by_front(grown, "map_sessions", "drives in the map", (1, 2, 4, 8, 16))
+
+
+def _by_front(
+    fronts: Sequence[Sequence[Row]], across: str, words: str, ticks: Sequence[int]
+) -> Figure:
+    """A curve for each policy: a row of panels for each measure, a column for each front-end."""
     figure, every = _panels(len(fronts))
     for rows, column in zip(fronts, every.T, strict=True):
-        usual = [one for one in pooled(rows) if one["map_sessions"] and one["lanes"] == "2"]
         for measure, axes in zip(MEASURES, column, strict=True):
             for place, (policy, label) in enumerate(LANES.items()):
-                own = [one for one in usual if one["policy"] == policy]
-                curve(axes, own, "map_sessions", measure, label, place=place)
-            _doubling(axes, (1, 2, 4, 8, 16))
-    return _titled(figure, every, "drives in the map")
+                own = [one for one in rows if one["policy"] == policy]
+                curve(axes, own, across, measure, label, place=place)
+            _doubling(axes, ticks)
+    return _titled(figure, every, words)
 
 
 def merging(rows: Sequence[Row]) -> Figure:
