@@ -93,11 +93,11 @@ LOOKALIKE = Likeness(share=float(np.log(0.25)), more_bits=3.0, unevenness=4.0)
 USUAL = Likeness(share=float(np.log(0.7)), more_bits=3.0, unevenness=2.0)
 
 
-def after(*found: Likeness, step_m: float = 2.0) -> Run:
-    run = Run(LookalikeConfig())
+def after(*found: Likeness, step_m: float = 2.0, run: Run | None = None, at_m: float = 0.0) -> Run:
+    run = run or Run(LookalikeConfig())
     for number, one in enumerate(found):
-        assert run.due(number * step_m)
-        run.add(one.alike(), number * step_m)
+        if run.due(at_m + number * step_m):
+            run.add(one.alike(), at_m + number * step_m)
     return run
 
 
@@ -107,6 +107,23 @@ def test_one_lookalike_is_doubted_and_a_run_of_usual_matches_is_believed_again()
     assert after(USUAL).proved
     assert after(*[LOOKALIKE] * 3, *[USUAL] * 20).proved
     assert not after(*[USUAL] * 3, *[LOOKALIKE] * 40).believed
+
+
+def test_a_run_that_has_shown_enough_is_judged_no_more_until_it_breaks() -> None:
+    run = after(*[USUAL] * 12, *[LOOKALIKE] * 40)
+    assert run.believed
+    assert run.proved
+    # Matches from 0 to 102 m, then none for 31 m.
+    assert not after(LOOKALIKE, run=run, at_m=133.0).believed
+    run = after(*[USUAL] * 12)
+    run.begin()
+    assert not after(LOOKALIKE, run=run, at_m=24.0).believed
+
+
+def test_holes_beyond_those_of_copies_are_no_sign_of_one() -> None:
+    van_ahead = Likeness(share=float(np.log(0.8)), more_bits=-0.5, unevenness=6.4)
+    assert after(van_ahead).proved
+    assert van_ahead.alike() == replace(van_ahead, unevenness=3.0).alike()
 
 
 def test_few_inliers_that_differ_in_many_bits_or_lie_everywhere_are_no_lookalikes() -> None:

@@ -38,8 +38,9 @@ _COLUMNS, _DEPTHS, _FARTHEST_M = 8, 8, 64.0
 _COUNTED = 175
 # Nearer or farther than by this factor a landmark looks different.
 _SAME_SIZE = 1.5
-# Less says no more: of few landmarks chance makes it small.
-_LEAST_UNEVENNESS = 0.5
+# Less says no more: of few landmarks chance makes it small. Nor does more: a front that was rebuilt
+# and a van that hides half of the view leave holes as large as copies do.
+_LEAST_UNEVENNESS, _MOST_UNEVENNESS = 0.5, 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +70,12 @@ class LookalikeConfig:
         ),
     ] = 0.08
     most: Annotated[
-        float, Meta(gt=0, description="greatest absolute log-odds of a run: it may change")
+        float,
+        Meta(
+            gt=0,
+            description="log-odds that a run is not of look-alikes, from which it is judged no "
+            "more while its matches are predicted; also the greatest that it is one",
+        ),
     ] = 8.0
     apart_m: Annotated[
         float,
@@ -255,7 +261,8 @@ class Likeness:
 
     def terms(self) -> tuple[float, float, float]:
         """What is weighed; see `Weights`."""
-        return self.share, self.more_bits, math.log(max(self.unevenness, _LEAST_UNEVENNESS))
+        uneven = min(max(self.unevenness, _LEAST_UNEVENNESS), _MOST_UNEVENNESS)
+        return self.share, self.more_bits, math.log(uneven)
 
     def alike(self, weights: Weights = ALIKE) -> float:
         """Log-odds that it is a look-alike."""
@@ -266,6 +273,9 @@ class Likeness:
 
 class Run:
     """The log-odds that a run of matches is one of look-alikes.
+
+    A run that has shown enough that it is none stays believed: where fronts were rebuilt a robot
+    that odometry and the map agree on cannot have come to another street.
 
     Attributes:
         believed: whether its matches are accepted.
@@ -290,6 +300,9 @@ class Run:
         if since_m > self._config.forgotten_after_m:
             self.begin()
             return True
+        if self._alike <= -self._config.most:
+            self._at_m = driven_m
+            return False
         return not self.believed or since_m >= self._config.again_m
 
     def add(self, alike: float, driven_m: float) -> None:
