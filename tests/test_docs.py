@@ -58,7 +58,7 @@ EXAMPLES = {
     DOCS / "ranking.md": "mapped",
     DOCS / "eyes.md": "nothing",
     DOCS / "operate.md": "fleet",
-    DOCS / "papers.md": "fleet",
+    DOCS / "paper-rules.md": "fleet",
     DOCS / "live.md": "first map",
     DOCS / "commands.md": "drives",
     DOCS / "compare.md": "nothing",

@@ -35,7 +35,7 @@ from engram.robot.localisers import localiser_in
 from engram.robot.settings import PAPERS, Settings, load_settings
 from engram.testing.contracts import make_node
 
-PAGE = Path(__file__).parents[1] / "docs" / "papers.md"
+PAGE = Path(__file__).parents[1] / "docs" / "paper-rules.md"
 WORLD = World(30.0)
 ROAD = np.arange(0.0, 25.0, 0.7)
 
