@@ -59,7 +59,8 @@ def test_parts_that_nothing_joins_are_drawn_apart_and_say_so(two_parts: Path) ->
         parts = parts_of(opened, title="town")
     titles = [panel.title for panel in parts.panels]
     assert titles[0].startswith("town: part 1 of 2, ")
-    assert titles[1].endswith("relation unknown")
+    assert titles[1].endswith("not joined yet")
+    assert "A part is what" in parts.caption("Colours: drives")
     sizes = [sum(len(track.points_m) for track in panel.tracks) for panel in parts.panels]
     assert sizes == sorted(sizes, reverse=True)
     assert parts.text() == ""

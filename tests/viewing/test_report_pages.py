@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +13,19 @@ from tests.pages import HOSTILE, check_page
 import engram
 from engram.frontend.frontend import make_thumbnail
 from engram.geometry.se3 import SE3
+from engram.localiser.localisation import LocalisationStatus
+from engram.robot.results import DriveResult, DriveSummary, ResultFrame
 from engram.sample.drives import write_drives
 from engram.viewing import report
-from engram.viewing.drawings import BY_ODOMETRY, NOWHERE, Course, as_svg, draw_strip
+from engram.viewing.drawings import (
+    BY_ODOMETRY,
+    NOWHERE,
+    PALETTE,
+    UNMEASURED,
+    Course,
+    as_svg,
+    draw_strip,
+)
 from engram.viewing.matches import NeighbouringDrives, ShownMatch, _relative, shows
 from engram.viewing.page import Page, commands, figures, paragraph, photograph, table
 
@@ -88,3 +100,57 @@ def test_a_strip_has_the_runs_and_gaps_of_a_drive() -> None:
     assert "35 m" in drawn
     empty = Course(at_m[:0], [], at_m[:0], localised[:0], nowhere[:0])
     assert "<svg" in as_svg(draw_strip(empty), "an empty drive")
+
+
+def test_frames_without_a_match_have_no_colour_of_a_drive() -> None:
+    """With as many drives as there are colours: hatching and marks tell the others apart."""
+    from matplotlib.colors import to_hex
+
+    drives = [f"drive {number}" for number in range(len(PALETTE))]
+    names = [*drives, BY_ODOMETRY, NOWHERE, UNMEASURED]
+    localised = np.array([name in drives for name in names])
+    places_m = np.full((len(names), 2), np.nan)
+    course = Course(np.arange(1.0, len(names) + 1), names, np.ones(len(names)), localised, places_m)
+    band, sure = draw_strip(course).axes
+    legend = [one.get_text() for one in band.get_legend().get_texts()]
+    assert legend == names
+    looks = dict(zip(names, band.get_legend().legend_handles, strict=True))
+    filled = {name: to_hex(looks[name].get_facecolor(), keep_alpha=True) for name in names}
+    assert len({(filled[name], looks[name].get_hatch()) for name in names}) == len(names)
+    assert not {filled[name][:7] for name in names[-3:] if filled[name][-2:] != "00"} & set(PALETTE)
+    (refused,) = [line for line in sure.lines if line.get_label() == "refused"]
+    assert refused.get_xdata().tolist() == course.at_m[~localised].tolist()
+    assert refused.get_marker() == "x"
+    assert to_hex(refused.get_color()) not in PALETTE
+    matched = [line for line in sure.lines if len(line.get_xdata()) and line is not refused]
+    assert [to_hex(line.get_color()) for line in matched] == list(PALETTE)
+
+
+def test_every_frame_of_a_drive_is_counted_once() -> None:
+    counts = {"localised": 5, "dead_reckoning": 3, "lost": 2, "no_odometry": 1}
+    frames = [
+        ResultFrame(stamp_ns=number, status=LocalisationStatus(status), step_m=1.0, confidence=1.0)
+        for number, status in enumerate(Counter(counts).elements())
+    ]
+    summary = DriveSummary(
+        frames=11, share_localised=5 / 11, statuses=counts, driven_m=11.0, longest_gap_m=6.0,
+        p_no_match_10m=0.0, attempts_per_frame=1.0,
+    )  # fmt: skip
+    result = DriveResult(summary=summary, frames=frames)
+    course = report.course_of(result, None)
+    assert Counter(course.names) == {"localised": 5, BY_ODOMETRY: 3, NOWHERE: 2, UNMEASURED: 1}
+    page = report.drive_page(result, None, None, [])
+    parts = re.findall(r"(\d+) (?:of 11 frames localised|by odometry alone|lost|without odometry)",
+                       page.verdict)  # fmt: skip
+    assert list(map(int, parts)) == [5, 3, 2, 1]
+    tiles = dict(report._drive_figures(summary))
+    assert [tiles[f"frames {name}"] for name in (BY_ODOMETRY, NOWHERE, UNMEASURED)] == [
+        "3", "2", "1",
+    ]  # fmt: skip
+
+
+def test_the_doctor_says_what_it_looked_at() -> None:
+    sound = " ".join(report.finding_section([]))
+    for subject in ("camera", "calibration", "stamps", "odometry"):
+        assert subject in sound
+    assert "nothing wrong" in sound

@@ -148,6 +148,7 @@ class Track:
         chain: (N,) int64; points of one number are joined by a line, in their order, with arrows
             in that direction. None: none are.
         starts: (N,) bool, the points where drives start; None for none.
+        mark: Matplotlib marker of the points.
     """
 
     label: str
@@ -155,6 +156,7 @@ class Track:
     colour: str | None = None
     chain: NDArray[np.int64] | None = None
     starts: NDArray[np.bool_] | None = None
+    mark: str = "."
 
     def lines(self) -> list[NDArray[np.float64]]:
         """The (K, 2) points of each line, metres in the map frame, K >= 2."""
@@ -230,16 +232,16 @@ def _fill(every: Sequence[Any], panels: Sequence[Panel]) -> None:
 
 def _add_legend(axes: Any, panel: Panel) -> None:
     if any(track.starts is not None and track.starts.any() for track in panel.tracks):
-        axes.plot([], [], "o", color=_MUTED, markerfacecolor=_PAPER, label="start of a drive")
+        axes.plot([], [], "o", color=_MUTED, markerfacecolor=_PAPER, label="first node of a drive")
     axes.legend(fontsize=8, loc="best", framealpha=0.9)
 
 
 def _draw_track(axes: Any, track: Track, colour: str) -> None:
     lines = track.lines()
     x, y = track.points_m[:, 0], track.points_m[:, 1]
-    axes.plot(x, y, ".", color=colour, markersize=3 if lines else 5)
+    axes.plot(x, y, track.mark, color=colour, markersize=3 if lines else 5)
     if track.label:
-        axes.plot([], [], "-" if lines else ".", color=colour, label=_shown(track.label))
+        axes.plot([], [], "-" if lines else track.mark, color=colour, label=_shown(track.label))
     for line in lines:
         axes.plot(line[:, 0], line[:, 1], "-", color=colour, linewidth=1.4, alpha=0.8)
     spacing_m = max(float(np.ptp(track.points_m, axis=0).max(initial=0.0)) / _ARROWS, 1.0)
@@ -420,6 +422,16 @@ class MapParts:
             f"{counted(len(left_out), 'smaller part')} ({counted(sum(left_out), 'node')}) not drawn"
         )
 
+    def caption(self, colours: str) -> str:
+        """What lies below the drawing: its colours, and what parts are, if there are several."""
+        words = f"{colours}; arrows: their direction; rings: their first nodes."
+        if len(self.above.sizes()) > 1:
+            words += (
+                " A part is what matches and odometry connect. How two parts lie to each other is "
+                "unknown until a drive leads from one to the other."
+            )
+        return f"{words} {text}." if (text := self.text()) else words
+
 
 def parts_of(opened: Map, by: str = "experience", title: str = "") -> MapParts:
     """What is drawn of a map.
@@ -476,7 +488,7 @@ def _part_title(title: str, number: int, count: int, nodes: int) -> str:
     size = counted(nodes, "node")
     if number == 0:
         return f"{title}: part 1 of {count}, {size}"
-    return f"part {number + 1}: {size}\nrelation unknown"
+    return f"part {number + 1}: {size}\nnot joined yet"
 
 
 def plot_map(
@@ -525,7 +537,9 @@ def draw_difference(map_path: Path, difference: MapDifference, path: Path) -> No
 
 
 # What stands for frames that no node matched, in strips and on maps.
-BY_ODOMETRY, NOWHERE = "by odometry alone", "lost"
+BY_ODOMETRY, NOWHERE, UNMEASURED = "by odometry alone", "lost", "without odometry"
+# Hatching and marks, no colours: those are the experiences'.
+_HATCHES = {BY_ODOMETRY: "", NOWHERE: "////", UNMEASURED: "xxxx"}
 # Stretches without a match that a strip writes the length of, metres.
 _LONG_GAP_M = 10.0
 
@@ -536,7 +550,8 @@ class Course:
 
     Attributes:
         at_m: (F,) float64, distance driven at each frame, metres, not decreasing.
-        names: of each frame the drive whose node it matched, `BY_ODOMETRY` or `NOWHERE`.
+        names: of each frame the drive whose node it matched, or one of `BY_ODOMETRY`, `NOWHERE`,
+            `UNMEASURED`.
         confidence: (F,) float64, log-odds, NaN where unknown.
         localised: (F,) bool.
         places_m: (F, 2) float64, x and y in the map frame, metres; NaN where unknown.
@@ -564,37 +579,62 @@ class Course:
 def draw_strip(course: Course) -> Any:
     """A drive over its distance: which drive's nodes it matched, and how surely."""
     figure, (band, sure) = subplots(2, width=_WIDTH_IN, height=3.6, rows=2)
-    names = [one for one in dict.fromkeys(course.names) if one not in (BY_ODOMETRY, NOWHERE)]
-    colours = {name: PALETTE[number % len(PALETTE)] for number, name in enumerate(sorted(names))}
-    colours |= {BY_ODOMETRY: "0.75", NOWHERE: LOST}
-    shown = set[str]()
+    names = sorted(set(course.names) - _HATCHES.keys())
+    colours = {name: PALETTE[number % len(PALETTE)] for number, name in enumerate(names)}
     for name, first, last in course.runs():
         start_m = float(course.at_m[first - 1]) if first else 0.0
         width_m = max(float(course.at_m[last]) - start_m, 1e-3)
-        label = None if name in shown else _shown(name)
-        band.broken_barh([(start_m, width_m)], (0, 1), color=colours[name], label=label)
-        shown.add(name)
+        band.broken_barh([(start_m, width_m)], (0, 1), **_filling(name, colours))
     for start_m, end_m in course.gaps():
         if end_m - start_m >= _LONG_GAP_M:
-            middle_m = (start_m + end_m) / 2
-            band.text(middle_m, 0.5, f"{end_m - start_m:.0f} m", ha="center", va="center",
-                      fontsize=8, color="black")  # fmt: skip
+            band.text(
+                (start_m + end_m) / 2, 0.5, f"{end_m - start_m:.0f} m", ha="center", va="center",
+                fontsize=8, color=_INK, bbox={"facecolor": _PAPER, "edgecolor": "none", "pad": 2},
+            )  # fmt: skip
     band.set_yticks([])
     band.set_title("Whose nodes each frame matched", fontsize=10)
-    if shown:
-        columns = min(len(shown), 3)
-        band.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=columns)
+    # The legend has the experiences first.
+    for name in [*names, *(one for one in _HATCHES if one in course.names)]:
+        band.broken_barh([], (0, 1), label=_shown(name), **_filling(name, colours))
+    _legend_below(band)
     for name, colour in colours.items():
-        chosen = np.array([one == name for one in course.names], bool)
-        chosen &= np.isfinite(course.confidence)
+        chosen = course.localised & np.array([one == name for one in course.names], bool)
         sure.plot(course.at_m[chosen], course.confidence[chosen], ".", color=colour, markersize=4)
-    sure.set_title("Confidence of the best attempt, log-odds", fontsize=10)
+    sure.plot([], [], ".", color=_INK, markersize=4, label="matched")
+    refused = ~course.localised & np.isfinite(course.confidence)
+    sure.plot(
+        course.at_m[refused], course.confidence[refused], "x", color=_INK, markersize=4,
+        label="refused",
+    )  # fmt: skip
+    sure.set_title("Confidence of the best attempt: log-odds that it is right", fontsize=10)
     sure.set_xlabel("distance driven, m", fontsize=9)
+    sure.legend(
+        fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2
+    )
     end_m = float(course.at_m[-1]) if len(course.at_m) else 1.0
     for axes in (band, sure):
         axes.set_xlim(0.0, max(end_m, 1e-3))
         axes.tick_params(labelsize=8)
     return figure
+
+
+def _filling(name: str, colours: Mapping[str, str]) -> dict[str, Any]:
+    """How a strip fills the frames of one name."""
+    if name in colours:
+        return {"color": colours[name]}
+    if not _HATCHES[name]:
+        return {"color": "0.75"}
+    return {"facecolor": "none", "edgecolor": _MUTED, "hatch": _HATCHES[name]}
+
+
+def _legend_below(axes: Any) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if labels:
+        columns = min(len(labels), 3)
+        axes.legend(
+            handles, labels, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.2),
+            ncols=columns,
+        )  # fmt: skip
 
 
 def draw_course(parts: MapParts, course: Course) -> Any:
@@ -610,10 +650,10 @@ def draw_course(parts: MapParts, course: Course) -> Any:
     for number, panel in enumerate(parts.panels):
         grey = [replace(track, label="", colour=_FEW) for track in panel.tracks]
         driven = [
-            Track(label, course.places_m[chosen], colour)
-            for label, colour, which in (
-                ("localised", GOOD, course.localised),
-                ("not localised", LOST, ~course.localised),
+            Track(label, course.places_m[chosen], colour, mark=mark)
+            for label, colour, mark, which in (
+                ("localised", GOOD, ".", course.localised),
+                ("not localised", _INK, "x", ~course.localised),
             )
             if np.any(chosen := np.asarray(which & (of == number), bool))
         ]

@@ -92,7 +92,7 @@ def as_jpeg(picture: Image) -> bytes:
 
 def commands(lines: Sequence[str]) -> str:
     """Commands to copy."""
-    return f'<pre tabindex="0">{text(chr(10).join(lines))}</pre>'
+    return f"<pre>{text(chr(10).join(lines))}</pre>"
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,7 @@ from engram.robot.robot import LastFrame
 from engram.viewing.drawings import (
     BY_ODOMETRY,
     NOWHERE,
+    UNMEASURED,
     Course,
     as_svg,
     draw_course,
@@ -50,11 +51,24 @@ from engram.viewing.pictures import side_picture
 from engram.viewing.weakness import HEAD, advice_text, draw_weakness, spot_rows, verdict
 from engram.weak_spots import WeakSpots, WeakSpotsConfig, find_weak_spots
 
+_LOCALISED = (
+    "Localised: the frame matched a node, a saved frame of the map, and the camera's pose in it is "
+    "known. By odometry alone: carried on from the last match. Lost: too far from it, so places "
+    "that look alike are tried all over the map. A confidence of 4.6 is one wrong match in a "
+    "hundred."
+)
+_EXAMINED = "It checks the camera, its calibration, the stamps and odometry, and nothing else."
 # Pictures of each kind, and the distance between the frames that they show, metres.
 _PICTURES, _APART_M = 3, 8.0
 # Revisions and drives that a page lists.
 _LISTED = 40
 _NO_STATUS = {LocalisationStatus.LOST, LocalisationStatus.DEAD_RECKONING}
+# What a drawing calls frames that no node matched.
+_UNMATCHED = {
+    LocalisationStatus.DEAD_RECKONING: BY_ODOMETRY,
+    LocalisationStatus.LOST: NOWHERE,
+    LocalisationStatus.NO_ODOMETRY: UNMEASURED,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,8 +129,8 @@ class Showcase:
         parts = [heading("Matches")]
         shelves = (
             ("Best: most inliers", self.best),
-            ("Weakest: least confidence", self.weakest),
-            ("Failed: farthest from a match, with the best attempt", self.failed),
+            ("Weakest: accepted with the least confidence", self.weakest),
+            ("Refused: farthest from a match, each with its best attempt", self.failed),
         )
         listed = set[int]()
         for title, shelf in shelves:
@@ -131,7 +145,10 @@ class Showcase:
         if len(parts) == 1:
             parts.append(paragraph("No picture: the frames have no images, or none was attempted."))
         else:
-            points = "Points of one colour are one landmark in both; lines join a few of them."
+            points = (
+                "Points of one colour are one landmark in both, an inlier: it agrees with the "
+                "pose. Lines join a few of them."
+            )
             parts.insert(1, paragraph(points, "muted"))
         return parts
 
@@ -151,10 +168,10 @@ def drive_page(
     sections = [figures(_drive_figures(summary))]
     about = (
         "Where the drive was localised over its distance: "
-        f"{summary.share_localised:.0%} of the frames, longest gap "
+        f"{summary.share_localised:.0%} of the frames, longest stretch between matches "
         f"{summary.longest_gap_m:.1f} m"
     )
-    sections += [heading("The drive"), drawing(as_svg(draw_strip(course), about), about + ".")]
+    sections += [heading("The drive"), drawing(as_svg(draw_strip(course), about), _LOCALISED)]
     if opened is not None:
         sections += _map_sections(opened, course)
     if showcase is not None:
@@ -169,13 +186,7 @@ def drive_page(
 
 def course_of(result: DriveResult, opened: Map | None) -> Course:
     """What the robot made of the drive's frames, with names from the map."""
-    names = []
-    for one in result.frames:
-        if one.status is LocalisationStatus.LOCALISED:
-            names.append(_drive_of(one.node, opened))
-        else:
-            lost = one.status is LocalisationStatus.LOST
-            names.append(NOWHERE if lost else BY_ODOMETRY)
+    names = [_UNMATCHED.get(one.status) or _drive_of(one.node, opened) for one in result.frames]
     poses = [one.pose() for one in result.frames]
     nowhere = np.full(2, np.nan)
     return Course(
@@ -201,35 +212,41 @@ def _drive_of(node: str | None, opened: Map | None) -> str:
 
 
 def _verdict(summary: DriveSummary) -> str:
+    statuses = summary.statuses
+    fates = [f"{statuses.get(status, 0)} {name}" for status, name in _UNMATCHED.items()]
     words = (
-        f"{summary.statuses.get('localised', 0)} of {counted(summary.frames, 'frame')} localised "
-        f"({summary.share_localised:.1%}) over {summary.driven_m:.0f} m; longest stretch without "
-        f"a match {summary.longest_gap_m:.1f} m."
+        f"{statuses.get('localised', 0)} of {counted(summary.frames, 'frame')} localised "
+        f"({summary.share_localised:.1%}) over {summary.driven_m:.0f} m, {', '.join(fates)}; "
+        f"longest stretch between matches {summary.longest_gap_m:.1f} m."
     )
     return words if summary.trusted else f"{words} The drive has a fatal fault: do not trust this."
 
 
 def _drive_figures(summary: DriveSummary) -> list[tuple[str, str]]:
-    total, statuses = summary.stages_ms.get("total", {}), summary.statuses
-    by_odometry, lost = (statuses.get(name, 0) for name in ("dead_reckoning", "lost"))
+    total = summary.stages_ms.get("total", {})
     return [
         ("localised", f"{summary.share_localised:.1%}"),
         ("driven", f"{summary.driven_m:.0f} m"),
-        ("longest gap", f"{summary.longest_gap_m:.1f} m"),
+        ("longest between matches", f"{summary.longest_gap_m:.1f} m"),
         ("route > 10 m from a match", f"{summary.p_no_match_10m:.1%}"),
         ("attempts per frame", f"{summary.attempts_per_frame:.2f}"),
-        ("frames by odometry, lost", f"{by_odometry}, {lost}"),
+        *(
+            (f"frames {name}", f"{summary.statuses.get(status, 0)}")
+            for status, name in _UNMATCHED.items()
+        ),
         ("unusable frames", f"{summary.unusable_frames}"),
         ("fixes withdrawn", f"{summary.withdrawn}"),
         ("ms a frame, median", f"{total.get('median', 0.0):.1f}"),
-        ("ms a frame, p99", f"{total.get('p99', 0.0):.1f}"),
+        ("ms a frame, 99 of 100", f"{total.get('p99', 0.0):.1f}"),
     ]
 
 
 def _map_sections(opened: Map, course: Course) -> list[str]:
     parts = parts_of(opened, title=Path(opened.location).name)
     about = f"The map from above, {counted(parts.nodes, 'node')}, and where the drive was localised"
-    shown = drawing(as_svg(draw_course(parts, course), about), _map_caption(parts.text()))
+    shown = drawing(
+        as_svg(draw_course(parts, course), about), parts.caption("Grey: the map's drives")
+    )
     served = Counter(course.names)
     rows = [
         (drive_text(session), opened.session_sizes()[session.id][0], served[drive_text(session)])
@@ -239,11 +256,6 @@ def _map_sections(opened: Map, course: Course) -> list[str]:
     caption = f"Drives of the map, and the frames that matched their nodes{_more(len(rows))}"
     head = ("drive", "nodes", "frames matched")
     return [heading("The map"), shown, table(head, rows[:_LISTED], caption)]
-
-
-def _map_caption(undrawn: str) -> str:
-    words = "Grey: the map's drives; arrows: their direction; rings: their starts."
-    return f"{words} {undrawn}." if undrawn else words
 
 
 def _more(rows: int) -> str:
@@ -261,9 +273,9 @@ def finding_section(findings: Sequence[Finding]) -> list[str]:
         )
         for one in findings
     ]
-    parts = [heading("The doctor")]
+    parts = [heading("The doctor"), paragraph(_EXAMINED, "muted")]
     if not rows:
-        return [*parts, paragraph("Nothing wrong with the drive.")]
+        return [*parts, paragraph("It found nothing wrong.")]
     return [*parts, table(("severity", "finding", "what", "cure"), rows, "Findings, worst first")]
 
 
@@ -284,8 +296,6 @@ def map_page(path: Path, next_commands: Sequence[str], weak: WeakSpotsConfig | N
         named = {str(one.id): drive_text(one) for one in opened.sessions.values()}
         weakness = _weak_section(find_weak_spots(opened, weak), opened)
     about = f"{path.name} from above: {counted(parts.nodes, 'node')} by drive"
-    colours = "Colours: drives; arrows: their direction; rings: their starts."
-    caption = f"{colours} {parts.text()}." if parts.text() else colours
     rows = [
         (named[one["session"]], one["nodes"], one["path_entries"], one["session"][:8])
         for one in sessions
@@ -309,7 +319,7 @@ def map_page(path: Path, next_commands: Sequence[str], weak: WeakSpotsConfig | N
     sections = [
         figures(tiles),
         heading("From above"),
-        drawing(as_svg(draw_parts(parts.panels), about), caption),
+        drawing(as_svg(draw_parts(parts.panels), about), parts.caption("Colours: drives")),
         *weakness,
         heading("Drives"),
         table(head, rows[:_LISTED], f"Drives in order of arrival{_more(len(rows))}"),

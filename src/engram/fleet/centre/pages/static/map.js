@@ -124,7 +124,7 @@ function draw() {
     item.append(dot, `${name} (${counted(n, "node")})`);
     return item;
   }));
-  if (some.length) legend.append(Object.assign(document.createElement("li"), { textContent: "○ start of a drive" }));
+  if (some.length) legend.append(Object.assign(document.createElement("li"), { textContent: "○ first node of a drive" }));
   if (weakHere()?.spots.length) legend.append(Object.assign(document.createElement("li"), { textContent: "broad, numbered: weak spot, broader the more is missed" }));
 }
 
