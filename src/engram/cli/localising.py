@@ -139,7 +139,7 @@ def _watchers(
     if outputs.pictures is None and outputs.report is None:
         return watchers, None
     images = NeighbouringDrives(outputs.drive)
-    shower = MatchShower(opened, robot.graph, session_of_drive(sequence), images)
+    shower = MatchShower(opened, robot, session_of_drive(sequence), images)
     if outputs.pictures is not None:
         every = max(1, len(sequence) // _PICTURES)
         watchers.append(PictureWriter(outputs.pictures, every, shower))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,15 +15,17 @@ import numpy as np
 
 from engram.counts import counted
 from engram.errors import EngramError, InputError
-from engram.frontend.frame import StereoPair
+from engram.frontend.frame import DescriptorKind, StereoPair
 from engram.frontend.frontend import make_thumbnail
 from engram.geometry.se3 import SE3
-from engram.graph.graph import ExperienceGraph
 from engram.graph.model import Session
+from engram.localiser.acceptance import AcceptanceConfig, Rule, determined
 from engram.localiser.attempts import Outcome, outcome_at
-from engram.localiser.localisation import Localisation
+from engram.localiser.confidence import confidence_of
+from engram.localiser.fixes import LEAST_WEIGHED
+from engram.localiser.localisation import Localisation, LocalisationStatus
 from engram.maps.map import Map
-from engram.robot.robot import LastFrame
+from engram.robot.robot import LastFrame, Robot
 from engram.sequences.layouts import ImageSequence
 from engram.sequences.opening import open_drive
 from engram.untrusted import printable
@@ -33,6 +36,11 @@ from engram.viewing.pictures import Image, match_picture, with_caption
 _SAME_IMAGE = 0.9
 # Drives next to one that are searched for the images of a map's nodes.
 _NEIGHBOURS = 20
+_STATES = {
+    LocalisationStatus.DEAD_RECKONING: "carried on by odometry",
+    LocalisationStatus.LOST: "lost",
+    LocalisationStatus.NO_ODOMETRY: "without odometry",
+}
 # A turn, and an offset to the side, that a caption mentions.
 _TURN_RAD, _ASIDE_M = float(np.deg2rad(5.0)), 0.5
 
@@ -120,15 +128,16 @@ class MatchShower:
 
     Args:
         opened: the map.
-        graph: that of the robot, with its own nodes.
+        robot: the robot that drives; its graph has its own nodes, too.
         session: the drive.
         images: where whole images may be found.
     """
 
     def __init__(
-        self, opened: Map, graph: ExperienceGraph, session: Session, images: Images | None = None
+        self, opened: Map, robot: Robot, session: Session, images: Images | None = None
     ) -> None:
-        self._opened, self._graph = opened, graph
+        self._opened, self._graph = opened, robot.graph
+        self._acceptance = robot.in_force.config.acceptance
         self._session, self._images = session, images or NoImages()
 
     def show(
@@ -150,8 +159,19 @@ class MatchShower:
             at_m,
             partial(self._picture, seen, best, node.stamp_ns, (f"map: {then}", f"drive: {now}")),
             f"{then} → {now}, {_sentence(best, matched=success is not None)}",
-            _details(seen, found, best, (mapped.robot, self._session.robot)),
+            self._details(seen, found, best, mapped.robot),
         )
+
+    def _details(self, seen: LastFrame, found: Localisation, best: Outcome, mapped_by: str) -> str:
+        mapped, drives = map(printable, (mapped_by, self._session.robot))
+        who = f"mapped by {mapped}, driven by {drives}" if mapped != drives else f"robot {drives}"
+        attempt = f"attempt {best.rank + 1} of {len(seen.outcomes)} made"
+        if found.localised:
+            judged = f"confidence {best.confidence:.1f}"
+        else:
+            why = refusal(best, seen.frame.descriptor, self._acceptance, doubted=seen.refused)
+            judged = f"refused: {why}; the robot is {_STATES[found.status]}"
+        return f"{who}; {attempt}; {judged}; node {str(best.candidate.node)[:8]}"
 
     def _live(self, seen: LastFrame) -> Image:
         if isinstance(seen.arrived, StereoPair):
@@ -190,7 +210,7 @@ def _sentence(best: Outcome, *, matched: bool) -> str:
     inliers = counted(best.match.inliers, "inlier")
     pose = best.match.reference_from_live
     if not matched:
-        return f"no match: {inliers}" if pose is not None else "no match: nothing agrees"
+        return f"no match: {inliers}" if pose is not None else "no match"
     assert pose is not None
     return f"{_relative(pose)}, {inliers}"
 
@@ -207,13 +227,76 @@ def _relative(node_from_live: SE3) -> str:
     return ", ".join(words)
 
 
-def _details(seen: LastFrame, found: Localisation, best: Outcome, robots: tuple[str, str]) -> str:
-    mapped, drives = map(printable, robots)
-    who = f"mapped by {mapped}, driven by {drives}" if mapped != drives else f"robot {drives}"
-    attempt = f"attempt {best.rank + 1} of {len(seen.outcomes)}"
-    sure = f", confidence {best.confidence:.1f}" if np.isfinite(best.confidence) else ""
-    lost = "" if found.localised else f"; {found.status.value.replace('_', ' ')}"
-    return f"{who}; {attempt}{sure}{lost}; node {str(best.candidate.node)[:8]}"
+def refusal(
+    outcome: Outcome, kind: DescriptorKind, acceptance: AcceptanceConfig, *, doubted: bool = False
+) -> str:
+    """Why an attempt that is no fix was refused, with the limit that `MatchRule` applied.
+
+    Args:
+        outcome: not accepted.
+        kind: of the live frame's features.
+        acceptance: in force.
+        doubted: whether the run of matches that it continues may be one of look-alikes.
+    """
+    if outcome.evidence is None:
+        return "no pose agrees with its matches"
+    elsewhere = "another match of the frame is nearer to where the robot is expected"
+    lookalike = "matches of the last metres show less than is usual here, as copies would"
+    return (
+        _not_weighed(outcome, acceptance)
+        or _not_sure(outcome, kind, acceptance)
+        or (lookalike if doubted else elsewhere)
+    )
+
+
+def _not_weighed(outcome: Outcome, acceptance: AcceptanceConfig) -> str:
+    """Why a match with a pose is not even weighed; "" if it is."""
+    inliers, expected = outcome.match.inliers, outcome.candidate.prediction is not None
+    fewest = acceptance.min_inliers
+    if acceptance.rule is Rule.INLIERS:
+        fewest = fewest if expected else acceptance.min_inliers_lost
+    elif expected and outcome.candidate.standing.agreed > 0:
+        fewest = LEAST_WEIGHED
+    if inliers < fewest:
+        return f"{counted(inliers, 'inlier')}, limit {fewest}"
+    if not determined(outcome.match, acceptance):
+        return f"its position is uncertain by more than {acceptance.max_sigma_m:g} m"
+    return ""
+
+
+def _not_sure(outcome: Outcome, kind: DescriptorKind, acceptance: AcceptanceConfig) -> str:
+    """Why a match that is weighed is too unsure; "" if it is sure enough."""
+    if acceptance.rule is Rule.INLIERS:
+        return "off the prediction, too far from the node, or on too little of the image"
+    readings = _readings(outcome, kind, acceptance)
+    confidence, limit, robot = max(readings, key=lambda one: one[0] - one[1])
+    if confidence >= limit:
+        return ""
+    if confidence == -math.inf:
+        return "contradicts where the robot is expected"
+    # Rounded down: what is below the limit shall look it.
+    return f"confidence {math.floor(100 * confidence) / 100:.2f}, limit {limit:.2f} {robot}"
+
+
+def _readings(
+    outcome: Outcome, kind: DescriptorKind, acceptance: AcceptanceConfig
+) -> list[tuple[float, float, str]]:
+    """Confidence, limit, and of which robot that is, of each reading of a match with a pose."""
+    model, candidate, evidence = confidence_of(kind), outcome.candidate, outcome.evidence
+    assert evidence is not None
+    readings = []
+    if candidate.prediction is not None and candidate.standing.agreed > 0:
+        near, limit = model.as_predicted(evidence), acceptance.min_confidence
+        readings.append((near, limit, "where a match is expected"))
+    elif candidate.prediction is not None:
+        near, limit = model.as_predicted(evidence), acceptance.min_confidence_told
+        readings.append((near, limit, "near an unconfirmed position"))
+    if candidate.prediction is None or candidate.doubted:
+        limit = acceptance.min_confidence_lost
+        if candidate.lost_long:
+            limit = max(limit, acceptance.sure_confidence)
+        readings.append((model.as_anywhere(evidence), limit, "for a lost robot"))
+    return readings
 
 
 class PictureWriter:

@@ -322,7 +322,7 @@ class _Run:
         ):
             records = ResultRecords(DisplayPose(opened.frame, robot.graph))
             session = session_of_drive(self.sequence)
-            showcase = Showcase(MatchShower(opened, robot.graph, session, self.images))
+            showcase = Showcase(MatchShower(opened, robot, session, self.images))
             for frame, found in enumerate(robot.drive(self.sequence, part)):
                 results.append(found)
                 records.see(found)
