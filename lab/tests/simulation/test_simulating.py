@@ -104,6 +104,20 @@ def test_what_is_there_is_not_rendered_again(short: Campaign, tmp_path: Path) ->
     assert Path(report.files[0]).read_bytes() == before
 
 
+def test_a_log_of_other_frames_is_rendered_again(tmp_path: Path) -> None:
+    """Such as that of a drive that began elsewhere; the words are people's."""
+    few = replace(campaign_named("hamlet", 2), spacing_m=60.0)
+    simulate(few, tmp_path, sessions=[0])
+    words: list[str] = []
+    later = replace(few, begins_m=60.0)
+    report = simulate(later, tmp_path, sessions=[0], monitor=Each(words.append))
+    assert (report.rendered, report.already_there) == (1, 0)
+    assert words == ["Mon 08:30, clear"] * len(SimulatedSequence(few, 0).drive.poses[1:])
+    np.testing.assert_array_equal(
+        FrameLog(report.files[0]).stamps_ns, SimulatedSequence(few, 0).truth().stamps_ns[1:]
+    )
+
+
 @pytest.mark.long
 def test_a_session_that_is_named_twice_is_rendered_once(short: Campaign, tmp_path: Path) -> None:
     words: list[str] = []

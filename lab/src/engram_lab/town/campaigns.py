@@ -29,6 +29,8 @@ WORLD_VERSION = 7
 
 
 _SUMMER_TIME = timedelta(hours=1)
+# From when to when the hour of a drive says more than its sky, UTC.
+_NIGHT_H, _MORNING_H = 22, 4
 
 
 class Size(StrEnum):
@@ -82,6 +84,12 @@ class SessionPlan:
         way = ("-reverse" if self.reverse else "") + ("-beside" if self.beside else "")
         return f"{self.number:03d}-{self.start:%m%dT%H%M}-{self.weather}-{self.robot}{way}"
 
+    @property
+    def words(self) -> str:
+        """Such as ``Tue 09:30, overcast``, for people; a night by its name, whatever its sky."""
+        night = self.start.hour >= _NIGHT_H or self.start.hour < _MORNING_H
+        return f"{self.start:%a %H:%M}, {'night' if night else self.weather}"
+
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
@@ -99,6 +107,7 @@ class Campaign:
             of `begbroke24h` by day, and is not rendered again.
         parked_share: of the parking places that are taken.
         spacing_m: way between frames.
+        begins_m: way along the route to the first frame.
         place: where on earth.
         fronts: how the fronts repeat; None where each is unique.
         first_day: from which structural change counts.
@@ -114,6 +123,7 @@ class Campaign:
     home: str
     parked_share: float = 0.45
     spacing_m: float = 0.7
+    begins_m: float = 0.0
     place: Place = OXFORD
     fronts: Fronts | None = None
 

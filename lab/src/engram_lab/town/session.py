@@ -74,7 +74,8 @@ class SimulatedDrive:
         self.line: Line = driving_line(self._streets, self._driven, self.plan.reverse)
         count = int(self.line.length_m // campaign.spacing_m)
         style = DrivingStyle(self.plan.seed)
-        self.poses: list[Pose] = drive(self.line, self.robot, style, campaign.spacing_m, count)
+        poses = drive(self.line, self.robot, style, campaign.spacing_m, count)
+        self.poses: list[Pose] = [one for one in poses if one.driven_m >= campaign.begins_m]
 
     @property
     def camera(self) -> StereoCamera:

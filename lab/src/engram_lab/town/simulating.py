@@ -35,7 +35,7 @@ from engram.sequences.motion_files import write_tum
 from engram.sequences.sequence import LoggedFrame
 from engram_lab.town.camera_model import Met
 from engram_lab.town.campaigns import WORLD_VERSION, Campaign
-from engram_lab.town.session import SimulatedSequence
+from engram_lab.town.session import SimulatedDrive, SimulatedSequence
 from engram_lab.truth import truth_path
 
 MOST_LANDMARKS = 2000  # of a frame that a log keeps, so that other numbers need no rendering
@@ -197,7 +197,7 @@ def simulate(
         for task in asked:
             if task not in tasks:
                 for _ in range(lengths[task.session]):
-                    part.advance(campaign.session(task.session).name)
+                    part.advance(campaign.session(task.session).words)
         if workers == 1 or len(tasks) < 2:
             for task in tasks:
                 _render(task, part)
@@ -235,7 +235,10 @@ def _is_done(task: _Task) -> bool:
         return False
     log = FrameLog(task.target)
     log.close()
-    if not log.complete:
+    drive = SimulatedDrive(task.campaign, task.session)
+    wanted_ns = [drive.stamp_ns(frame) for frame in range(len(drive))]
+    # A log may be of other frames: those of another spacing, or of drives that begin elsewhere.
+    if not log.complete or log.stamps_ns.tolist() != wanted_ns:
         return False
     # A campaign is of one make, or its sessions do not compare.
     return bring_up_to_date(task.target, task.settings) is not Upkeep.OUTDATED
@@ -268,7 +271,7 @@ def _render(task: _Task, monitor: Monitor) -> None:
         return
 
     def count(_: str) -> None:
-        monitor.advance(sequence.info.name)
+        monitor.advance(sequence.drive.plan.words)
 
     truth_path(task.target).unlink(missing_ok=True)  # it says that the session is whole
     if _is_outdated(task.target):
@@ -300,7 +303,7 @@ def _write_images(sequence: SimulatedSequence, target: Path, monitor: Monitor) -
         for name, image in (("image_0", pair.left), ("image_1", pair.right)):
             _write(target / name / f"{k:06d}.png", cv2.imencode(".png", image)[1].tobytes())
         stamps.append(pair.stamp_ns)
-        monitor.advance(sequence.info.name)
+        monitor.advance(sequence.drive.plan.words)
     projection = np.array(
         [[camera.fx, 0, camera.cx, 0], [0, camera.fy, camera.cy, 0], [0, 0, 1, 0]]
     )
