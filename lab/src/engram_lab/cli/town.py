@@ -50,22 +50,24 @@ def demo(
 
 
 def _show(report: DemoReport) -> None:
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    from engram_lab.demo.story import INTRODUCTION
+    from engram_lab.demo.story import INTRODUCTION, LIMITS, MEANING, OWN_COMMANDS, OWN_DRIVES
 
     console = Console(file=drawing(sys.stdout))
-    console.print(INTRODUCTION)
+    console.print(f"{INTRODUCTION}\n{MEANING}")
     for one in report.tables():
-        console.print(f"\n{one.title}: {one.about}")
-        shown = Table(*one.head)
+        console.print(f"\n{one.title}. {one.about}")
+        shown = Table(*one.head, box=SIMPLE_HEAD, show_edge=False, collapse_padding=True)
+        shown.columns[0].no_wrap = True
         for row in one.rows:
             shown.add_row(*row)
         console.print(shown)
+    console.print(f"{report.accuracy()} {LIMITS}")
+    console.print("\n  ".join([OWN_DRIVES, *OWN_COMMANDS]))
     console.print(
-        f"{report.sharing()}\n`distance` tries the nearest node first. `recall`, the default, "
-        "first tries nodes of experiences that served before where the latest matches did.\n"
         f"Look at {report.page}: the tables, the place in six conditions, and the later drives' "
         "matches as pictures."
     )

@@ -13,12 +13,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.counts import counted
 from engram.errors import InputError
 from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.merge.merging import merge
-from engram.localiser.localisation import Localisation
+from engram.geometry.se3 import SE3
+from engram.localiser.localisation import Budget, Localisation
 from engram.maps.map import open_map
 from engram.monitor import QUIET, Monitor
 from engram.robot.localisers import session_of_drive
@@ -29,9 +29,10 @@ from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_on, summarise
 from engram.sequences.opening import open_drive
 from engram.viewing.matches import MatchShower, shows
-from engram.viewing.page import Page, as_jpeg, heading, paragraph, photograph, table
+from engram.viewing.page import Page, as_jpeg, commands, heading, paragraph, photograph, table
 from engram.viewing.pictures import Image
-from engram.viewing.report import Showcase, drive_page, made_by
+from engram.viewing.report import Showcase, drive_page, made_by, typed
+from engram_lab.accuracy import is_false
 from engram_lab.town.camera_model import CLEAN
 from engram_lab.town.campaigns import Campaign, campaign_named
 from engram_lab.town.session import SimulatedDrive
@@ -40,32 +41,88 @@ from engram_lab.town.simulating import simulate
 # Who maps which drives. The last robot has never been here.
 _MAPPED = {"wildcat": (0, 2, 3), "courier": (1,)}
 _LATER = {"courier": 4, "scout": 5}
-# How people know the maps in which the later drives are localised.
-_OWN, _FLEET = "its own map", "the fleet's map"
+# What people call the maps in which the later drives are localised.
+_OWN, _FLEET, _SENT = "its own map", "the fleet's map", "its download"
 _POLICIES = ("recall", "distance")
+# Whose later drive the policies are compared on, in the fleet's map: the night is harder.
+_RANKED = "courier"
 # One attempt, or one after another up to four: what counts is which experience is tried first.
 _ATTEMPTS = (1, 4)
 # The scout's mission on Thursday morning, and the share of the fleet's map that it downloads.
 _DEPARTS_H, _SHARE_PERCENT = 9.0, 60.0
 # Between frames, half as many as the hamlet has: rendering is most of what the demo costs.
 _SPACING_M = 1.4
+# The route begins in mid-bend, where no earlier motion tells odometry of the turn.
+_BEGINS_M = 4.0
 # The place that is shown in every condition, as a share of the drive.
 _SHOWN_AT = 0.35
 INTRODUCTION = (
-    "wildcat, courier and scout are robots with stereo cameras, in a simulated hamlet. wildcat and "
-    "courier each map their drives and hand in their maps. Then courier drives by night, and "
-    "scout, which has never been here, by day, both with the map that the fleet shares."
+    "wildcat, courier and scout are simulated robots with stereo cameras, in a hamlet. Nobody "
+    "gives them a position: they find it by appearance, and drive on by odometry from their "
+    "images. wildcat and courier map their drives and hand in their maps. Then courier, which "
+    "mapped one afternoon, drives by night, and scout, here for the first time, by day, both with "
+    "the map that the fleet shares. It has wildcat's night."
 )
+MEANING = (
+    "Localised: the frame matched a node, a frame kept in the map, well enough to measure its pose "
+    "from there and to steer by it. gap: the longest way between two matches. error: the median, "
+    "by the simulator's truth. false: fixes more than 1 m or 5° off. Frames are 1.4 m apart to "
+    "save time; the doctor, who looks for faults of drives, warns of that."
+)
+LIMITS = (
+    "This is a simulation; of real images only short drives of KITTI and EuRoC were tried. "
+    "Figures, rain and snow, and what fails: docs/evidence.md."
+)
+OWN_DRIVES = "Your own drive, a ROS bag or a folder of stereo images (docs/data.md):"
+OWN_COMMANDS = ("engram doctor DRIVE", "engram map town.engram DRIVE")
 
 
 def demo_campaign() -> Campaign:
-    """The hamlet's drives at 1.4 m between frames; a second night in place of the rain."""
+    """The hamlet's drives, sparser and from behind its first bend; a second night for the rain."""
     hamlet = campaign_named("hamlet")
     first_night = hamlet.sessions[3]
     later = first_night.start + timedelta(days=1, minutes=15)
     second = replace(hamlet.sessions[4], start=later, weather=first_night.weather, lens=CLEAN)
     sessions = (*hamlet.sessions[:4], second, *hamlet.sessions[5:])
-    return replace(hamlet, name="demo", sessions=sessions, spacing_m=_SPACING_M)
+    return replace(hamlet, name="demo", sessions=sessions, spacing_m=_SPACING_M, begins_m=_BEGINS_M)
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """The fixes of a drive, against the simulator's truth.
+
+    Attributes:
+        error_m: of each fix, between the true and the measured position in the matched node.
+        false: those more than 1 m or 5° off.
+    """
+
+    error_m: tuple[float, ...]
+    false: int
+
+    @staticmethod
+    def of(results: Iterable[Localisation], world_from_cam: Mapping[int, SE3]) -> Judged:
+        """Judges the results of a drive by the true poses of all drives' frames, by stamp."""
+        errors = []
+        for one in results:
+            if one.node_stamp_ns is not None and one.node_from_live is not None:
+                node = world_from_cam[one.node_stamp_ns]
+                off = one.node_from_live.inverse() @ node.inverse() @ world_from_cam[one.stamp_ns]
+                errors.append((off.distance_m, off.angle_rad))
+        return Judged(
+            tuple(error_m for error_m, _ in errors), sum(is_false(*one) for one in errors)
+        )
+
+    def __add__(self, other: Judged) -> Judged:
+        return Judged(self.error_m + other.error_m, self.false + other.false)
+
+    @property
+    def median_cm(self) -> str:
+        """The median error in words, centimetres."""
+        return f"{100 * float(np.median(self.error_m)):.1f}" if self.error_m else "–"
+
+    def text(self) -> str:
+        """For people."""
+        return f"median error {self.median_cm} cm, {self.false} of {len(self.error_m)} fixes false"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +134,7 @@ class MappedDrive:
         new: nodes saved where nothing matched.
         weak: nodes saved where few landmarks matched.
         why: a sentence on what surprises; "" if nothing does.
+        frames: of the drive.
     """
 
     drive: str
@@ -84,28 +142,35 @@ class MappedDrive:
     new: int
     weak: int
     why: str
+    frames: int
+    judged: Judged
 
     @staticmethod
-    def of(drive: str, mapped: MapReport, *, first: bool) -> MappedDrive:
+    def of(drive: str, mapped: MapReport, judged: Judged, *, first: bool) -> MappedDrive:
         """What a drive added; `first` if its robot's map was empty."""
+        frames = len(mapped.results)
         saved = [one for one in mapped.results if one.saved is not None]
         weak = sum(one.localised for one in saved)
-        share = sum(one.localised for one in mapped.results) / max(len(mapped.results), 1)
-        return MappedDrive(
-            drive, share, len(saved) - weak, weak, _why(share, len(saved), weak, first=first)
-        )
+        share = sum(one.localised for one in mapped.results) / max(frames, 1)
+        why = _why(share, len(saved), weak, first=first)
+        return MappedDrive(drive, share, len(saved) - weak, weak, why, frames, judged)
+
+    def row(self) -> tuple[str, ...]:
+        """What people read of it."""
+        localised = f"{self.localised * self.frames:.0f} of {self.frames}"
+        return self.drive, localised, str(self.new), str(self.weak), self.why
 
 
 def _why(share: float, saved: int, weak: int, *, first: bool) -> str:
     if first:
-        return "the robot's map was empty: all of it is new"
+        return "its map was empty"
     if not saved:
         return "nothing new"
     if weak > saved / 2:
-        return "recognised, but weakly in this light: kept for the next drive like it"
+        return "recognised, but weakly"
     if share < 0.7:
-        return "much of it looks unlike every drive before: an experience of its own"
-    return ""
+        return "much of it unlike before"
+    return "most of it known"
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +182,21 @@ class LaterDrive:
     policy: str
     attempts: int
     summary: dict[str, Any]
+    judged: Judged
+
+    def figures(self) -> tuple[str, ...]:
+        """What people read of it."""
+        summary, judged = self.summary, self.judged
+        return (
+            f"{summary['share_localised']:.0%}",
+            f"{summary['longest_gap_m']:.1f}",
+            judged.median_cm,
+            f"{judged.false}",
+        )
+
+
+# Heads of `LaterDrive.figures`.
+_FIGURES = ("localised", "gap, m", "error, cm", "false")
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +217,8 @@ class DemoReport:
         page: the report, an HTML page.
         taken, covered: of each robot, nodes that the fleet's map took, and that it had already.
         downloaded: share of the fleet's map in bytes.
+        downloaded_bytes, of_bytes: the same, and the whole.
+        sent: of each drive, nodes that were downloaded, and all in the fleet's map.
     """
 
     out: Path
@@ -145,6 +227,9 @@ class DemoReport:
     taken: dict[str, int] = field(default_factory=dict)
     covered: dict[str, int] = field(default_factory=dict)
     downloaded: float = 0.0
+    downloaded_bytes: int = 0
+    of_bytes: int = 0
+    sent: dict[str, tuple[int, int]] = field(default_factory=dict)
     shared: list[LaterDrive] = field(default_factory=list)
     ranked: list[LaterDrive] = field(default_factory=list)
 
@@ -153,55 +238,63 @@ class DemoReport:
         return dict(msgspec.to_builtins(self, enc_hook=str))
 
     def sharing(self) -> str:
-        """What the fleet's map took of each robot, in words."""
-        robots = [
-            f"{robot} handed in {counted(taken + self.covered[robot], 'node')}, of which "
-            f"{self.covered[robot]} were covered already"
+        """What the fleet's map took of each robot, and what scout downloads of it, in words."""
+        took = " and ".join(
+            f"{taken} of {robot}'s {taken + self.covered[robot]}"
             for robot, taken in self.taken.items()
-        ]
-        return f"{'; '.join(robots)}. scout downloads {self.downloaded:.0%} of the fleet's bytes."
+        )
+        sent = ", ".join(
+            f"{some} of {every} from {drive}" for drive, (some, every) in self.sent.items()
+        )
+        return (
+            f"The fleet's map took {took} nodes; the others matched nodes that it had. scout loads "
+            f"{self.downloaded_bytes / 1e6:.1f} of {self.of_bytes / 1e6:.1f} MB of it, the nodes "
+            f"that a drive at {_DEPARTS_H:.0f} o'clock most likely needs: {sent}."
+        )
+
+    def accuracy(self) -> str:
+        """How right all fixes are, in words."""
+        judged = [one.judged for one in self.mapped]
+        judged += [one.judged for one in (*self.shared, *self.ranked)]
+        return f"In all these drives: {sum(judged, Judged((), 0)).text()}."
 
     def tables(self) -> list[DemoTable]:
         """What people read of it."""
-        grown = [
-            (one.drive, f"{one.localised:.0%}", str(one.new), str(one.weak), one.why)
-            for one in self.mapped
-        ]
-        shared = [(one.drive, one.map, *_figures(one.summary)) for one in self.shared]
-        ranked = [
-            (
-                one.policy,
-                str(one.attempts),
-                f"{one.summary['attempts_per_frame']:.2f}",
-                *_figures(one.summary),
-            )
-            for one in self.ranked
-        ]
-        last = self.ranked[-1].drive if self.ranked else ""
+        budget, lane = RobotOptions().budget, Budget(lanes=1)
+        last = f"{self.ranked[-1].drive}, in {self.ranked[-1].map}" if self.ranked else ""
         return [
             DemoTable(
-                "Each robot's map grows where a place is new to it, or matches weakly",
-                "Nodes saved: new, where nothing matched; weak, where few landmarks did.",
+                "Each robot maps what its map lacks",
+                "A frame that matches nothing becomes a new node, and one that matches weakly a "
+                "weak one, unless odometry fails there.",
                 ("drive", "localised", "new", "weak", "why"),
-                grown,
+                [one.row() for one in self.mapped],
             ),
             DemoTable(
                 "Then they share",
-                "The same drives with either map, four attempts a frame.",
-                ("drive", "with", "localised", "longest gap, m"),
-                shared,
+                f"{self.sharing()} A frame is tried with up to {budget.attempts} nodes, that of a "
+                f"lost robot with up to {budget.lost_attempts}. By night in a map of days it is "
+                "lost until one happens to match: wildcat on Tuesday, courier in its own map.",
+                ("drive", "map", *_FIGURES),
+                [(one.drive, one.map.removesuffix(" map"), *one.figures()) for one in self.shared],
             ),
             DemoTable(
                 "Which node to try first",
-                f"{last}, by policy and attempts allowed for a frame.",
-                ("policy", "allowed", "made a frame", "localised", "longest gap, m"),
-                ranked,
+                f"{last}, by attempts allowed for a frame, {lane.lost_attempts} while lost, and "
+                "made. distance tries the nearest node first; recall, the default, the one "
+                "likeliest to match: near, and matched just before or by past drives.",
+                ("policy", "allowed", "made", *_FIGURES),
+                [
+                    (
+                        one.policy,
+                        str(one.attempts),
+                        f"{one.summary['attempts_per_frame']:.2f}",
+                        *one.figures(),
+                    )
+                    for one in self.ranked
+                ],
             ),
         ]
-
-
-def _figures(summary: Mapping[str, Any]) -> tuple[str, str]:
-    return f"{summary['share_localised']:.0%}", f"{summary['longest_gap_m']:.1f}"
 
 
 class Rendered:
@@ -213,10 +306,27 @@ class Rendered:
         }
         self._kept: dict[int, Image] = {}
 
+    def world_from_cam(self) -> dict[int, SE3]:
+        """The true pose of every frame, by its stamp."""
+        return {
+            stamp: drive.poses[frame].world_from_cam for stamp, (drive, frame) in self._at.items()
+        }
+
     def prepare(self, stamps_ns: Iterable[int]) -> None:
-        """Renders images drive by drive: the town is built again wherever the drive changes."""
-        for stamp_ns in sorted(stamps_ns):
+        """Renders images drive by drive, and the place that is shown of each of these drives.
+
+        The town is built again wherever the drive changes.
+        """
+        wanted = {stamp_ns for stamp_ns in stamps_ns if stamp_ns in self._at}
+        wanted |= {_place_ns(self._at[stamp_ns][0]) for stamp_ns in wanted}
+        for stamp_ns in sorted(wanted):
             self._image(stamp_ns)
+
+    def place(self, drive: SimulatedDrive) -> Image:
+        """The place that is shown of every drive, (h, w) uint8."""
+        image = self._image(_place_ns(drive))
+        assert image is not None
+        return image
 
     def _image(self, stamp_ns: int) -> Image | None:
         if stamp_ns not in self._kept and stamp_ns in self._at:
@@ -228,6 +338,10 @@ class Rendered:
         """See `engram.viewing.matches.Images`."""
         image = self._image(stamp_ns)
         return image if image is not None and shows(image, small) else None
+
+
+def _place_ns(drive: SimulatedDrive) -> int:
+    return drive.stamp_ns(int(_SHOWN_AT * len(drive)))
 
 
 def run_demo(out: Path, monitor: Monitor = QUIET, workers: int = 2) -> DemoReport:
@@ -246,9 +360,11 @@ def run_demo(out: Path, monitor: Monitor = QUIET, workers: int = 2) -> DemoRepor
     logs = [Path(file) for file in rendered.files]
     for file in out.glob("*.engram*"):
         file.unlink()
-    for robot, numbers in _MAPPED.items():
-        for number in numbers:
-            report.mapped.append(_map(out, robot, logs[number], drives[number], monitor))
+    images = Rendered(drives)
+    truth = images.world_from_cam()
+    in_order = sorted((number, robot) for robot, numbers in _MAPPED.items() for number in numbers)
+    for number, robot in in_order:
+        report.mapped.append(_map(out, robot, logs[number], drives[number], truth, monitor))
     fleet = out / "fleet.engram"
     for merged in merge(fleet, [out / f"{robot}.engram" for robot in _MAPPED], monitor=monitor):
         robot = Path(merged.source).stem
@@ -258,45 +374,73 @@ def run_demo(out: Path, monitor: Monitor = QUIET, workers: int = 2) -> DemoRepor
     )
     sent = download(fleet, out / "scout.engram", mission, monitor=monitor)
     report.downloaded = sent.size_bytes / sent.of_bytes
-    sections = _localise_all(report, logs, drives, monitor)
-    _page(report, drives, sections).write(report.page, made_by())
+    report.downloaded_bytes, report.of_bytes = sent.size_bytes, sent.of_bytes
+    every, some = _nodes_by_drive(fleet), _nodes_by_drive(out / "scout.engram")
+    for number, _ in in_order:
+        start_ns = drives[number].stamp_ns(0)
+        if every.get(start_ns, 0) > 1:
+            name = f"{drives[number].plan.start:%a %H:%M}"
+            report.sent[name] = some.get(start_ns, 0), every[start_ns]
+    sections = _localise_all(report, logs, drives, images, monitor)
+    _page(report, drives, images, sections).write(report.page, made_by())
     return report
 
 
-def _map(out: Path, robot: str, log: Path, drive: SimulatedDrive, monitor: Monitor) -> MappedDrive:
+def _nodes_by_drive(map_path: Path) -> dict[int, int]:
+    """Number of nodes of each drive of a map, by its start, ns."""
+    with open_map(map_path) as opened:
+        sizes = opened.session_sizes()
+        return {session.start_ns: sizes[one][0] for one, session in opened.sessions.items()}
+
+
+def _map(
+    out: Path,
+    robot: str,
+    log: Path,
+    drive: SimulatedDrive,
+    truth: Mapping[int, SE3],
+    monitor: Monitor,
+) -> MappedDrive:
     map_path, sequence = out / f"{robot}.engram", open_drive(log, robot=robot)
     first, about = not map_path.exists(), _about(drive, robot)
     with monitor.stage(f"map: {about}", len(sequence)) as part:
         mapped = map_drive(map_path, sequence, Settings(), RobotOptions(), part)
-    return MappedDrive.of(about, mapped, first=first)
+    return MappedDrive.of(about, mapped, Judged.of(mapped.results, truth), first=first)
 
 
 def _about(drive: SimulatedDrive, robot: str) -> str:
-    plan = drive.plan
-    night = ", night" if plan.start.hour >= 22 else f", {plan.weather}"
-    return f"{plan.start:%a %H:%M}{night}, {robot}"
+    return f"{drive.plan.words}, {robot}"
 
 
 def _localise_all(
-    report: DemoReport, logs: Sequence[Path], drives: Sequence[SimulatedDrive], monitor: Monitor
+    report: DemoReport,
+    logs: Sequence[Path],
+    drives: Sequence[SimulatedDrive],
+    images: Rendered,
+    monitor: Monitor,
 ) -> list[str]:
-    """Localises the later drives; the parts of a page about those with the fleet's map."""
-    images, out, sections = Rendered(drives), report.out, list[str]()
+    """Localises the later drives; the parts of a page about those with what the fleet shares."""
+    out, sections = report.out, list[str]()
+    truth = images.world_from_cam()
+    fleet = out / "fleet.engram"
+    maps = {
+        "courier": {_OWN: out / "courier.engram", _FLEET: fleet},
+        "scout": {_SENT: out / "scout.engram", _FLEET: fleet},
+    }
     for robot, number in _LATER.items():
-        maps = {_OWN: out / f"{robot}.engram", _FLEET: out / "fleet.engram"}
-        if robot == "scout":
-            maps = {_FLEET: out / "scout.engram"}
-        about = _about(drives[number], robot)
-        for name, map_path in maps.items():
-            part = _Run(about, map_path, open_drive(logs[number], robot=robot), images)
-            summary = part.localise("recall", max(_ATTEMPTS), monitor, shown=name == _FLEET)
-            report.shared.append(LaterDrive(about, name, "recall", max(_ATTEMPTS), summary))
-            sections += part.sections
+        for name, map_path in maps[robot].items():
+            log = open_drive(logs[number], robot=robot)
+            run = _Run(_about(drives[number], robot), name, map_path, log, images, truth)
+            shown = name == (_FLEET if robot == "courier" else _SENT)
+            report.shared.append(run.localise(RobotOptions(), monitor, shown=shown))
+            sections += run.sections
+    number = _LATER[_RANKED]
     for policy in _POLICIES:
         for most in _ATTEMPTS:
-            run = _Run(about, maps[_FLEET], open_drive(logs[number], robot=robot), images)
-            summary = run.localise(policy, most, monitor, shown=False)
-            report.ranked.append(LaterDrive(about, _FLEET, policy, most, summary))
+            log = open_drive(logs[number], robot=_RANKED)
+            run = _Run(_about(drives[number], _RANKED), _FLEET, fleet, log, images, truth)
+            options = RobotOptions(ranking=policy, lanes=1, rounds=most)
+            report.ranked.append(run.localise(options, monitor, shown=False))
     return sections
 
 
@@ -305,16 +449,18 @@ class _Run:
     """A drive in a map; `sections` of a page about it."""
 
     about: str
+    name: str
     map_path: Path
     sequence: Any
     images: Rendered
+    truth: Mapping[int, SE3]
     sections: list[str] = field(default_factory=list)
 
-    def localise(self, policy: str, most: int, monitor: Monitor, *, shown: bool) -> dict[str, Any]:
-        """The summary of the drive by one policy and number of attempts."""
-        options = RobotOptions(ranking=policy, lanes=1, rounds=most)
+    def localise(self, options: RobotOptions, monitor: Monitor, *, shown: bool) -> LaterDrive:
+        """The drive by these options."""
         results, at_m = list[Localisation](), 0.0
-        what = f"localise: {self.about}, {policy}, {most} a frame"
+        policy, most = options.ranking, options.budget.attempts
+        what = f"localise: {self.about}, in {self.name}, {policy}, {most} a frame"
         with (
             open_map(self.map_path) as opened,
             robot_on(opened, self.sequence, Settings(), options) as robot,
@@ -330,43 +476,54 @@ class _Run:
                 if shown and robot.last is not None:
                     showcase.see(robot.last, found, frame, at_m)
             summary = summarise(results)
+            judged = Judged.of(results, self.truth)
             if shown:
                 self.images.prepare(showcase.stamps_ns())
-                log = self.sequence.path
-                whole = {"map": self.map_path.name, "drive": self.about, "summary": summary,
+                findings = robot.diagnosis.to_dict()["findings"]
+                whole = {"map": self.map_path.name, "drive": self.about,
+                         "summary": {**summary, "findings": findings},
                          "frames": records.frames(results)}  # fmt: skip
-                again = f"engram localise {self.map_path} {log} --report drive.html"
-                page = drive_page(msgspec.convert(whole, DriveResult), opened, showcase, [again])
-                self.sections = [heading(self.about), paragraph(page.verdict), *page.sections]
-        return summary
+                again = ["# The log holds landmarks and odometry, no images.", self._again()]
+                page = drive_page(msgspec.convert(whole, DriveResult), opened, showcase, again)
+                self.sections = [
+                    heading(f"{self.about}, in {self.name}"),
+                    paragraph(f"{page.verdict} By the truth: {judged.text()}."),
+                    *page.sections,
+                ]
+        return LaterDrive(self.about, self.name, policy, most, summary, judged)
+
+    def _again(self) -> str:
+        """The command that localises the drive as the demo did."""
+        robot, log = self.sequence.info.robot, self.sequence.path
+        return typed(
+            "engram", "localise", self.map_path, log, "--robot", robot, "--report", "drive.html"
+        )
 
 
-def _page(report: DemoReport, drives: Sequence[SimulatedDrive], sections: list[str]) -> Page:
+def _page(
+    report: DemoReport, drives: Sequence[SimulatedDrive], images: Rendered, sections: list[str]
+) -> Page:
     """The report: the story in tables, the place in all conditions, and the later drives."""
     place = photograph(
-        as_jpeg(_one_place(drives)),
+        as_jpeg(_one_place(drives, images)),
         "One place in the six drives",
         "Left images, in the order of time; the last two are of the later drives.",
     )
-    parts = [place, paragraph(report.sharing())]
+    parts = [paragraph(MEANING), place]
     for one in report.tables():
         parts += [heading(one.title), table(one.head, one.rows, one.about)]
-    verdict = " ".join(
-        f"{drive.drive}: {drive.summary['share_localised']:.0%} localised with {drive.map}."
-        for drive in report.shared
-    )
-    return Page("Engram's demo", f"{INTRODUCTION} {verdict}", [*parts, *sections])
+    parts += [paragraph(report.accuracy())]
+    own = [heading("Your own drives"), paragraph(OWN_DRIVES), commands(OWN_COMMANDS)]
+    return Page("Engram's demo", INTRODUCTION, [*parts, *sections, *own, paragraph(LIMITS)])
 
 
-def _one_place(drives: Sequence[SimulatedDrive]) -> NDArray[np.uint8]:
+def _one_place(drives: Sequence[SimulatedDrive], images: Rendered) -> NDArray[np.uint8]:
     """The same place in each drive, with its condition below."""
     robots = {number: robot for robot, number in _LATER.items()}
     robots |= {number: robot for robot, numbers in _MAPPED.items() for number in numbers}
     tiles = []
     for number, drive in enumerate(drives):
-        at = int(_SHOWN_AT * len(drive))
-        pair = next(iter(drive.frames(at, at + 1)))
-        tile = cv2.resize(pair.left, (512, 384))
+        tile = cv2.resize(images.place(drive), (512, 384))
         tile = cv2.copyMakeBorder(tile, 0, 28, 0, 0, cv2.BORDER_CONSTANT, value=(0,))
         words = _about(drive, robots[number])
         cv2.putText(
