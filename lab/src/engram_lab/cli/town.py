@@ -65,12 +65,11 @@ def _show(report: DemoReport) -> None:
         for row in one.rows:
             shown.add_row(*row)
         console.print(shown)
-    console.print(f"{report.accuracy()} {LIMITS}")
-    console.print("\n  ".join([OWN_DRIVES, *OWN_COMMANDS]))
     console.print(
-        f"Look at {report.page}: the tables, the place in six conditions, and the later drives' "
-        "matches as pictures."
+        f"\n{report.accuracy()} {LIMITS}\nLook at {report.page}: the tables, the place in six "
+        "conditions, and the later drives' matches as pictures."
     )
+    console.print("\n  ".join([OWN_DRIVES, *OWN_COMMANDS]))
     has_screen = sys.platform == "darwin" or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
     if sys.stdout.isatty() and has_screen:
         webbrowser.open(report.page.resolve().as_uri())
