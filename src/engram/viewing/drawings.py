@@ -600,17 +600,18 @@ def draw_strip(course: Course) -> Any:
     for name, colour in colours.items():
         chosen = course.localised & np.array([one == name for one in course.names], bool)
         sure.plot(course.at_m[chosen], course.confidence[chosen], ".", color=colour, markersize=4)
-    sure.plot([], [], ".", color=_INK, markersize=4, label="matched")
     refused = ~course.localised & np.isfinite(course.confidence)
-    sure.plot(
-        course.at_m[refused], course.confidence[refused], "x", color=_INK, markersize=4,
-        label="refused",
-    )  # fmt: skip
+    if refused.any():
+        sure.plot([], [], ".", color=_INK, markersize=4, label="matched")
+        sure.plot(
+            course.at_m[refused], course.confidence[refused], "x", color=_INK, markersize=4,
+            label="refused",
+        )  # fmt: skip
+        sure.legend(
+            fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2
+        )
     sure.set_title("Confidence of the best attempt: log-odds that it is right", fontsize=10)
     sure.set_xlabel("distance driven, m", fontsize=9)
-    sure.legend(
-        fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2
-    )
     end_m = float(course.at_m[-1]) if len(course.at_m) else 1.0
     for axes in (band, sure):
         axes.set_xlim(0.0, max(end_m, 1e-3))
