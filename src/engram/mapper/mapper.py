@@ -339,8 +339,8 @@ class VoteConfig:
 
     against: Annotated[
         int,
-        Meta(ge=1, description="frames that contradict an edge before it is distrusted, plus "
-             "twice the frames that agree with it"),
+        Meta(ge=1, description="frames that contradict an edge before it is distrusted; at "
+             "least twice as many as agree with it"),
     ] = 4  # fmt: skip
     inliers: Annotated[
         int,
