@@ -93,14 +93,16 @@ def test_what_cannot_be_used_is_named_with_its_package(
         load("one")
     text = str(caught.value)
     assert text.startswith(f"{what} 'one' of package-0 0.1 cannot be used: {reason}")
-    assert text.endswith("; mend that package or uninstall it")
+    assert text.endswith("; fix that package or uninstall it")
 
 
 @pytest.mark.parametrize("group", LOADS)
 def test_a_name_that_two_packages_add_is_refused(added, group: str) -> None:
     what, load = LOADS[group]
     added(group, "SOMETHING", "SOMETHING")
-    with pytest.raises(IncompatibleError, match=f"{what} 'one' is added by package-0 0.1 and pack"):
+    with pytest.raises(
+        IncompatibleError, match=f"{what} 'one' is provided by package-0 0.1 and pack"
+    ):
         load("one")
 
 

@@ -56,7 +56,7 @@ class PluginGroup(Generic[T]):
         if len(entries) > 1:
             packages = " and ".join(sorted(_package(entry) for entry in entries))
             raise IncompatibleError(
-                f"{self.what} {name!r} is added by {packages}; uninstall all but one of them"
+                f"{self.what} {name!r} is provided by {packages}; uninstall all but one of them"
             )
         (entry,) = entries
         try:
@@ -64,7 +64,7 @@ class PluginGroup(Generic[T]):
         except Exception as error:  # the code of others may fail in any way
             reason = str(error) if isinstance(error, EngramError) else _named(error)
             raise IncompatibleError(
-                f"{self.what} {name!r} of {_package(entry)} cannot be used: {reason}; mend that "
+                f"{self.what} {name!r} of {_package(entry)} cannot be used: {reason}; fix that "
                 "package or uninstall it"
             ) from error
 

@@ -146,7 +146,7 @@ class SqliteFile:
         if version < kind.format_version:
             raise FormatVersionError(
                 f"{self.path} is a {kind.noun} of format {version}, this Engram ({__version__}) "
-                f"reads format {kind.format_version} alone: {kind.older}"
+                f"reads only format {kind.format_version}: {kind.older}"
             )
 
     def is_new(self, execute: Execute) -> bool:
@@ -185,8 +185,8 @@ class SqliteFile:
             )
         if present != wanted:
             raise MapCorruptError(
-                f"{self.path}: not the tables of its format: missing {sorted(wanted - present)}, "
-                f"unexpected {sorted(present - wanted)}"
+                f"{self.path}: does not have the tables of its format: missing "
+                f"{sorted(wanted - present)}, unexpected {sorted(present - wanted)}"
             )
         columns: dict[str, list[tuple[str, int]]] = {}
         for table, column, hidden in execute(_COLUMNS).fetchall():

@@ -69,7 +69,7 @@ def test_a_frame_without_candidates_is_told_as_such(
         (("--explain", 99), "no frame 99"),
         (("--explain", 3, "--ranking", "oracle"), "oracle"),
         (("--explain", 3, "--ranking", "nearest"), "no ranking policy"),
-        (("--explain", 3, "--rate", 20), "takes no --rate"),
+        (("--explain", 3, "--rate", 20), "leave out --rate"),
     ],
 )
 def test_what_cannot_be_explained_is_refused(

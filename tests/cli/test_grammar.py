@@ -251,7 +251,7 @@ def test_map_says_what_became_of_every_frame_and_what_to_try_next(
     assert "next: engram localise" in first.out
     again = engram("map", town, street, "--robot", "r1")
     assert "nothing to do" in again.out
-    assert "begin behind it with --frames" in again.out
+    assert "start after it with --frames" in again.out
     second = engram("map", town, street, "--robot", "r2")
     assert second.out.startswith("known area: 0 nodes saved")
     found = engram("localise", town, street)

@@ -186,14 +186,14 @@ def test_a_cap_takes_first_what_serves_least(centre: Path, fleet) -> None:
         assert of_one.chosen(store, 0).nodes <= alone.keys()
         with pytest.raises(InputError, match="are not reached"):
             replace(of_one, down_to=(1, None)).chosen(store, 0)
-    with pytest.raises(RevisionError, match="nothing of what is to be forgotten"):
+    with pytest.raises(RevisionError, match="nothing that is to be forgotten"):
         forget(centre, Retention(down_to=(10**12, None)), author="tests")
     assert forget(centre, Retention(down_to=(None, 50.0)), author="tests").nodes == len(half)
     assert check_file(centre).problems == ()
 
 
 def test_where_nothing_lies_nothing_is_forgotten(centre: Path) -> None:
-    with pytest.raises(RevisionError, match="nothing of what is to be forgotten"):
+    with pytest.raises(RevisionError, match="nothing that is to be forgotten"):
         forget(centre, Retention(region=(1e6, 1e6, 1.0)), author="tests")
 
 

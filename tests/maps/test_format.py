@@ -155,7 +155,7 @@ def test_it_is_sound_and_can_be_written_on(stored: Path) -> None:
 @pytest.mark.parametrize(
     ("version", "advice"),
     [
-        (FORMAT_VERSION - 1, "reads format 7 alone: engram upgrade converts maps of format 6"),
+        (FORMAT_VERSION - 1, "reads only format 7: engram upgrade converts maps of format 6"),
         (FORMAT_VERSION + 1, "reads up to 7: upgrade Engram"),
     ],
 )

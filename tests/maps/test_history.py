@@ -277,7 +277,9 @@ class TestBlame:
         writer.commit()
         firsts = [str(node.id)[0] for node in drive.nodes]
         twice = next(digit for digit in firsts if firsts.count(digit) > 1)
-        with pytest.raises(InputError, match=rf"nodes begin with '{twice}', give more: {twice}"):
+        with pytest.raises(
+            InputError, match=rf"nodes begin with '{twice}', give more characters: {twice}"
+        ):
             store.origin(twice)
 
     @pytest.mark.parametrize("prefix", ["", "-", "xyz", "0" * 33])

@@ -222,7 +222,7 @@ def test_exports_hold_every_node(copy, tmp_path):
         ("", "is empty"),
         ("node,x,y\n", "holds no anchors"),
         ("node,x\na,1\n", "no position"),
-        ("x,y\n1,2\n", "give a node or a time"),
+        ("x,y\n1,2\n", "give either a node or a time"),
         ("node,x,y\na,one,2\n", "not a number"),
         ("node,lat,lon\na,91,2\n", "not latitude, longitude"),
         ("time,x,y\nnoon,1,2\n", "line 2"),

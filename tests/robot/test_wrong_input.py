@@ -58,7 +58,7 @@ def robot(opened: Map) -> Iterator[Robot]:
         (
             StereoPair(LATER_NS, GREY, GREY, replace(CAMERA, fx=CAMERA.fx + 1)),
             IncompatibleError,
-            "give each camera a robot of its own",
+            "use a separate robot for each camera",
         ),
     ],
 )

@@ -117,7 +117,7 @@ class TestContainers:
     def test_two_bags_in_a_folder_are_two_drives(self, tmp_path) -> None:
         for name in ("monday", "tuesday"):
             WHOLE.write(tmp_path / name, "ros1")
-        with pytest.raises(SequenceError, match=r"(?s)holds some.*monday\.bag.*tuesday\.bag"):
+        with pytest.raises(SequenceError, match=r"(?s)contains some.*monday\.bag.*tuesday\.bag"):
             open_drive(tmp_path)
 
     def test_messages_are_those_of_rosbags(self, tmp_path, kind) -> None:

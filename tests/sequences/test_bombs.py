@@ -70,7 +70,7 @@ def test_the_header_says_what_is_decoded(ending, shape):
 
 @pytest.mark.parametrize("bomb", [png, tiff, sun_raster, pfm, jpeg_2000])
 def test_a_small_image_that_claims_a_gigapixel_is_not_decoded(bomb):
-    with pytest.raises(SequenceError, match=r"claims 30000×30000 px.*not decoded|no readable"):
+    with pytest.raises(SequenceError, match=r"claims 30000×30000 px.*not decoded|not a readable"):
         decoded("bomb", bomb())
 
 
@@ -95,7 +95,7 @@ def aliases(depth: int, width: int = 10) -> str:
 def test_aliases_are_not_written_out(tmp_path, camera, lens):
     path = tmp_path / "camchain.yaml"
     path.write_text(aliases(9) + "cam0:\n" + LENS.format(camera=camera, lens=lens) + "cam1: {}\n")
-    with pytest.raises(CalibrationError, match="aliases make too much of a short text"):
+    with pytest.raises(CalibrationError, match="aliases expand to too much text"):
         read_calibration(path)
 
 
@@ -103,7 +103,7 @@ def test_aliases_are_not_written_out(tmp_path, camera, lens):
 def test_an_alias_that_holds_itself_is_refused(tmp_path, loop):
     path = tmp_path / "camchain.yaml"
     path.write_text(loop)
-    with pytest.raises(CalibrationError, match=r"an alias holds itself|recursive"):
+    with pytest.raises(CalibrationError, match=r"an alias refers to itself|recursive"):
         read_calibration(path)
 
 

@@ -609,7 +609,7 @@ class TestFolders:
         path = plain_folder(tmp_path / "m", lambda at, _: f"{at:03d}.png")
         for file in (path / "left").iterdir():
             file.write_text("nothing")
-        with pytest.raises(SequenceError, match="no readable image") as raised:
+        with pytest.raises(SequenceError, match="not a readable image") as raised:
             list(open_drive(path))
         assert "drive.skip_bad" not in str(raised.value)
 

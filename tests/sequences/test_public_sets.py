@@ -253,13 +253,17 @@ class TestFourSeasons:
             ("undistorted_calib_0.txt", "Pinhole 40 40 23.5", "must be 'Pinhole fx fy cx cy'"),
             ("undistorted_calib_0.txt", "EquiDistant 40 40 23 15\n48 32", "must be 'Pinhole"),
             ("undistorted_calib_1.txt", "Pinhole 40 40 23 15 0.1\n48 32", "without distortion"),
-            ("undistorted_calib_1.txt", "Pinhole 41 41 23 15\n48 32", "differ: they are no pair"),
+            (
+                "undistorted_calib_1.txt",
+                "Pinhole 41 41 23 15\n48 32",
+                "differ: they are not a pair",
+            ),
             ("undistorted_calib_stereo.txt", "1 0 0", "must hold 16 finite numbers, not 3"),
             ("undistorted_calib_stereo.txt", "1 0 0 x", "could not convert"),
             (
                 "undistorted_calib_stereo.txt",
                 "1 0 0 .3  0 1 0 .1  0 0 1 0  0 0 0 1",
-                "a shift along x alone",
+                "a shift along x only",
             ),
         ],
     )

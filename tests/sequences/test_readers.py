@@ -276,9 +276,9 @@ def _floating_point(path: Path) -> None:
 
 
 IMAGE_FAULTS = {
-    "cut short": (_cut_short, "no readable image|cut short"),
+    "cut short": (_cut_short, "not a readable image|cut short"),
     "empty": (_empty, "empty"),
-    "no image": (_no_image, "no readable image"),
+    "no image": (_no_image, "not a readable image"),
     "wrong size": (_wrong_size, "48×33 px, the calibration says 48×32"),
     "a folder": (_a_folder, "cannot be read"),
     "a gigapixel": (_gigapixel, "60000×60000 px.*not decoded"),
@@ -680,7 +680,7 @@ class TestFirstHour:
     def test_a_folder_above_drives_names_them(self, tmp_path: Path, name: str) -> None:
         path = LAYOUTS[name].write(tmp_path)
         (tmp_path / "notes.txt").write_text("sunny")
-        with pytest.raises(SequenceError, match="holds some; name one of") as caught:
+        with pytest.raises(SequenceError, match="contains some; name one of") as caught:
             open_drive(tmp_path)
         assert str(path) in str(caught.value)
 

@@ -120,7 +120,7 @@ def read_yaml(text: str) -> dict[str, Any]:
         fact = str(error).splitlines()[0] if str(error) else "malformed"
         raise CalibrationError(f"not valid YAML: {fact}") from error
     if spread > 4 * MAX_CHARACTERS:  # without aliases it is at most twice the text
-        raise CalibrationError("its aliases make too much of a short text; write it out")
+        raise CalibrationError("its YAML aliases expand to too much text; write them out")
     if not isinstance(entries, dict):
         raise CalibrationError("holds no calibration (a table of names and values)")
     return entries
@@ -136,7 +136,7 @@ def _characters(value: Any, known: dict[int, int]) -> int:
         return 1 + len(value or "")
     length = known.setdefault(id(value), -1)
     if length == 0:
-        raise ValueError("an alias holds itself")
+        raise ValueError("an alias refers to itself")
     if length < 0:
         known[id(value)] = 0
         parts = [*value, *value.values()] if isinstance(value, dict) else value

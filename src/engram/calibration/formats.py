@@ -466,7 +466,7 @@ def _partner(path: Path) -> dict[str, Any]:
     partner = _partner_path(path)
     if partner is None:
         raise CalibrationError(
-            "is one camera's calibration, and the other's is not next to it: name the pair "
+            "holds one camera's calibration, but the other's is not next to it: name the pair "
             "left.yaml and right.yaml, and give left.yaml"
         )
     return read_yaml(read_text(partner, CalibrationError, 4 * MAX_CHARACTERS))

@@ -213,9 +213,9 @@ def localise(
     """Find a drive in a map.
 
     The map is not changed, unless --remember keeps the drive's path and match attempts, which rank
-    candidates for later drives. If the drive has a fatal fault (see engram doctor), the result is
-    not to be trusted, and the exit status is 5. --explain localises the drive up to one frame, then
-    lists that frame's candidates: why they are in this order, and which of them match.
+    candidates for later drives. If the drive has a fatal fault (see engram doctor), do not trust
+    the result; the exit status is 5. --explain localises the drive up to one frame, then lists that
+    frame's candidates: why they are in this order, and which of them match.
 
     \b
     Examples:
@@ -259,7 +259,7 @@ def localise(
         "--remember": remember or None, "--recorder": recorder, "--view": view, "--report": report,
     }  # fmt: skip
     for option in (option for option, value in refused.items() if value is not None):
-        raise ConfigError(f"--explain is about one frame and takes no {option}")
+        raise ConfigError(f"--explain is about one frame; leave out {option}")
     names = ("ranking", "lanes", "rounds", "relocaliser")
     frame = ExplainOptions(explain, **{name: tried[name] for name in names}, at=at)
     explain_and_print(map_path, sequence, resolved, frame, as_json=as_json)

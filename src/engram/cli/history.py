@@ -185,7 +185,7 @@ def revert(
     message: Message = "",
     as_json: options.Json = False,
 ) -> None:
-    """Undo a revision by a new one.
+    """Undo a revision with a new one.
 
     The new revision hides what the old one added. Nothing is deleted: earlier revisions stay
     readable, and reverting the new revision restores everything.

@@ -200,7 +200,7 @@ class Effort:
         typer.Option(
             "--memory",
             metavar="SIZE",
-            help="Most memory of the map's landmarks and graph: 200MB [default: 300MB].",
+            help="Memory limit of the map's landmarks and graph: 200MB [default: 300MB].",
             hidden=True,
         ),
     ] = None

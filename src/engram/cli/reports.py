@@ -47,12 +47,12 @@ def report(
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
-    """Make a page of a map, a drive or a result.
+    """Make a report of a map, a drive or a result.
 
-    One file to look at and to pass on: it needs no network and runs no script. Of a map it shows
-    the map from above, its weak spots, drives and history; of a drive what the doctor finds, with
-    stereo pairs; of a result where the drive was localised, by whose nodes, and the gaps. With
-    pictures of the matches: engram localise MAP DRIVE --report FILE.html.
+    Writes one HTML file to view and share; it needs no network and runs no script. For a map it
+    shows the map from above, its weak spots, drives and history; for a drive, what the doctor
+    finds, with stereo pairs; for a result, where the drive was localised, by whose nodes, and the
+    gaps. To include pictures of the matches: engram localise MAP DRIVE --report FILE.html.
 
     \b
     Examples:
@@ -167,9 +167,9 @@ def evaluate(
     """Compare a drive with its ground truth.
 
     Prints the absolute error (ATE, after a rigid alignment) and the relative error (RPE) as evo
-    does. Of a drive this is the odometry, of a result the poses in the map, with the share of
-    frames localised and the longest gap. Poses are compared at stamps at most 10 ms apart. KITTI's
-    format has no stamps: one line for each frame.
+    does. For a drive it evaluates the odometry; for a result, the poses in the map, with the share
+    of frames localised and the longest gap. Poses are compared at stamps at most 10 ms apart.
+    KITTI's format has no stamps: one line for each frame.
 
     \b
     Examples:

@@ -24,7 +24,7 @@ def settings(
     *,
     given: options.SettingsGiven,
     every: Annotated[
-        bool, typer.Option("--all", help="Experts' settings, too, which may change.")
+        bool, typer.Option("--all", help="Include expert settings, which may change.")
     ] = False,
     toml: Annotated[bool, typer.Option("--toml", help="Print a file that --config reads.")] = False,
     as_json: options.Json = False,

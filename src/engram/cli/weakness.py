@@ -41,9 +41,9 @@ def weak_spots(
 ) -> None:
     """Predict where the next drives will be lost.
 
-    Names the stretches and hours, at most a tenth of the route and the day, in which most of what
-    the next drives will miss is expected; why; and which drive would mend most of it. It learns
-    from what past drives left in the map: their paths, the nodes that they saved, and the attempts
+    Names the stretches and hours, at most a tenth of the route and day, in which the next drives
+    are expected to miss most; the reasons; and the drive that would help most. It learns from what
+    past drives left in the map: their paths, the nodes that they saved, and the attempts
     of robots that map or --remember. Metres are those of the named drive, by odometry from its
     start. With --set weak_spots.latitude_deg=52 hours are compared by the height of the sun.
 

@@ -27,8 +27,8 @@ def mapped_text(report: Mapping[str, Any], map_path: Path | str) -> str:
         return (
             f"nothing to do: the map already contains this drive (session {report['session']}). "
             f"To change its zone, start or robot: engram amend {typed(map_path)} "
-            f"{report['session'][:8]}. A drive is known by its first frame: to map frames that "
-            "were left out, begin behind it with --frames"
+            f"{report['session'][:8]}. A drive is identified by its first frame: to map frames "
+            "that were left out, start after it with --frames"
         )
     share, saved = report["share_localised"], report["nodes_saved"]
     area = "new area" if share <= _NEW else "partly new area"

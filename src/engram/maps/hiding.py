@@ -255,9 +255,7 @@ def _check_not_erased(connection: Connection, made: list[Row]) -> None:
         for part in few(keys):
             erased = (receipts.c.record == record) & receipts.c.target.in_(part)
             if connection.execute(select(receipts.c.key).where(erased).limit(1)).first():
-                raise RevisionError(
-                    "it forgot what has been erased since: nothing brings that back"
-                )
+                raise RevisionError("what it forgot has since been erased and cannot be restored")
 
 
 def compare(connection: Connection, number: int, before: int, after: Revision) -> Reverted:

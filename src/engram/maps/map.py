@@ -850,7 +850,7 @@ class Map:
         def forgotten(connection: Connection, own: View, row: Row) -> Forgotten:
             gone = hide_chosen(connection, self._keys, own, row["key"], chosen)
             if not any(gone.values()):
-                raise RevisionError(f"{self.location} holds nothing of what is to be forgotten")
+                raise RevisionError(f"{self.location} holds nothing that is to be forgotten")
             write_bridges(connection, self._keys, row["key"], bridges)
             revision = commit_revision(connection, row, *brought(connection, row))
             return result_of(connection, revision.number, gone, len(bridges))

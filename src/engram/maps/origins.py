@@ -80,7 +80,9 @@ def origin_of(connection: Connection, view: View, prefix: str) -> Origin:
     if len(rows) > 1:
         listed = ", ".join(str(node_from_bytes(row["uuid"])) for row in rows[:_LISTED])
         more = f" and {len(rows) - _LISTED} more" if len(rows) > _LISTED else ""
-        raise InputError(f"{len(rows)} nodes begin with {prefix!r}, give more: {listed}{more}")
+        raise InputError(
+            f"{len(rows)} nodes begin with {prefix!r}, give more characters: {listed}{more}"
+        )
     return _origin(connection, view, rows[0])
 
 

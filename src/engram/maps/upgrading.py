@@ -343,7 +343,7 @@ def _compare(source: sqlite3.Connection, made: sqlite3.Connection) -> int:
         for old, new in zip(source.execute(query), made.execute(query), strict=True):
             compared += 1
             if old != new:
-                raise MapCorruptError(f"table {table.name}: row {old[0]} came out otherwise")
+                raise MapCorruptError(f"table {table.name}: row {old[0]} came out differently")
     return compared
 
 
@@ -386,7 +386,7 @@ def _compare_attempts(source: sqlite3.Connection, made: sqlite3.Connection) -> i
             getattr(old, name).tobytes() != getattr(new, name).tobytes()
             for name in (*COLUMNS, "policy")
         ):
-            raise MapCorruptError(f"table attempts: those of row {drive[1]} came out otherwise")
+            raise MapCorruptError(f"table attempts: those of row {drive[1]} came out differently")
     return compared
 
 

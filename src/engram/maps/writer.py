@@ -581,8 +581,8 @@ class RevisionWriter:
         with self._database.reading() as connection:
             if forgotten_of(connection, self._view, [one.bytes]):
                 raise InputError(
-                    f"{what} {one} was forgotten in {self._database.name} and is not taken in "
-                    "again; engram log says why"
+                    f"{what} {one} was forgotten in {self._database.name} and is not added "
+                    "again; engram log shows why"
                 )
 
     def _add_path(self, path: PathId, session_key: int, partial: bool) -> None:

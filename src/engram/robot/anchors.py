@@ -105,7 +105,7 @@ _PAIRS = (("lat", "lon"), ("x", "y"), ("u", "v"))
 def _csv_rows(text: str, source: Path) -> Iterable[tuple[int, dict[str, str]]]:
     reader = csv.DictReader(text.splitlines())
     if reader.fieldnames is None:
-        raise InputError(f"{source}: is empty; expected a head such as node,x,y or time,lat,lon")
+        raise InputError(f"{source}: is empty; expected a header such as node,x,y or time,lat,lon")
     for row in reader:
         yield (
             reader.line_num,
@@ -162,7 +162,7 @@ def _given_in_row(
 
     node, time = row.get("node") or None, row.get("time") or None
     if (node is None) == (time is None):
-        raise InputError(f"{source}, line {line}: give a node or a time, one of them")
+        raise InputError(f"{source}, line {line}: give either a node or a time")
     first, second = (number(name) for name in kind)
     assert first is not None
     assert second is not None

@@ -96,7 +96,7 @@ class Front:
         if self._camera is not None and camera != self._camera:
             raise IncompatibleError(
                 f"the frame at {stamp_of(arrived)} ns is of camera {camera.id[:8]}, the robot's is "
-                f"{self._camera.id[:8]}; give each camera a robot of its own"
+                f"{self._camera.id[:8]}; use a separate robot for each camera"
             )
         if not isinstance(motion, Motion | OutsideMotion | None):
             raise InputError(
@@ -286,8 +286,8 @@ def check_position(position: Position, graph: ExperienceGraph) -> None:
         raise InputError("a position's pose and (6, 6) covariance must be finite numbers")
     if position.node not in graph:
         raise InputError(
-            f"the map has no node {position.node}; give a position in this map, or none: the robot "
-            "then searches"
+            f"the map has no node {position.node}; give a position in this map, or None: the "
+            "robot then searches"
         )
 
 

@@ -89,7 +89,7 @@ def read_mask(path: Path, cameras: Cameras) -> NDArray[np.bool_]:
         )
     mask: NDArray[np.bool_] = image > 127
     if not mask.any():
-        raise ConfigError(f"mask {path}: is black throughout; white is what is used")
+        raise ConfigError(f"mask {path}: is entirely black; white marks what is used")
     return mask
 
 
@@ -128,7 +128,7 @@ def check_sides(cameras: Cameras, pairs: Iterable[StereoPair], where: object) ->
     if len(shifts) < _ENOUGH:
         raise CalibrationError(
             f"{where}: are left and right swapped? the projections state a negative baseline, and "
-            "the images leave it open; exchange them, or make P[3] of the right camera negative, "
+            "the images cannot decide; exchange them, or make P[3] of the right camera negative, "
             "−fx·baseline"
         )
     if np.mean(np.array(shifts) < 0) > _EXCHANGED:

@@ -118,7 +118,8 @@ def _claimed(where: object, content: bytes) -> tuple[int, int]:
 
 def _unreadable(where: object, content: bytes) -> SequenceError:
     return SequenceError(
-        f"{where}: no readable image ({len(content)} bytes): damaged, cut short, or something else"
+        f"{where}: not a readable image ({len(content)} bytes): damaged, cut short, or "
+        "another kind of file"
     )
 
 

@@ -719,8 +719,8 @@ def _named_alike(left: Path, right: Path) -> list[dict[str, Path]]:
         return bare
     first = [next(iter(side.values())).name for side in sides]
     raise SequenceError(
-        f"{left} and {right}: no two images have one name, as {first[0]} and {first[1]}: rename "
-        "them so that the images of a pair have the same name on both sides"
+        f"{left} and {right}: no image has the same name on both sides; the first are {first[0]} "
+        f"and {first[1]}: give the images of a pair the same name"
     )
 
 
@@ -756,8 +756,8 @@ def _named_by_stamp(folder: Path) -> list[StampedFile]:
         what = _UNITS.get(len(str(files[0].stamp_ns)))
         if what is not None:
             raise SequenceError(
-                f"{files[0].path}, {files[1].path.name}, …: the names are stamps in {what[0]}, it "
-                f"seems, and must be in ns: append {what[1]} to each, or {_TIMES_NEEDED}"
+                f"{files[0].path}, {files[1].path.name}, …: the names seem to be stamps in "
+                f"{what[0]}, but must be in ns: append {what[1]} to each, or {_TIMES_NEEDED}"
             )
         raise SequenceError(
             f"{files[0].path}, {files[1].path.name}, …: the names are frame numbers, not stamps "
@@ -917,8 +917,7 @@ def utias_stamps(path: Path) -> dict[int, int]:
         frame, stamp_ns = (nanoseconds(part.strip()) for part in f"{line},".split(",")[:2])
         if frame is None or stamp_ns is None or frame in stamps_ns:
             raise SequenceError(
-                f"{path}: line {number} is not 'frame,stamp_ns' of a frame of its own: "
-                f"{line[:60]!r}"
+                f"{path}: line {number} is not 'frame,stamp_ns' of a new frame: {line[:60]!r}"
             )
         stamps_ns[frame] = stamp_ns
     if not stamps_ns:
@@ -958,7 +957,7 @@ def _fourseasons_cameras(path: Path) -> Cameras:
     sides = [_pinhole(folder / f"undistorted_calib_{number}.txt") for number in (0, 1)]
     values, sizes = zip(*sides, strict=True)
     if sizes[0] != sizes[1] or np.abs(values[0] - values[1]).max() > _SAME_INTRINSICS_PX:
-        raise CalibrationError(f"{folder}: the two undistorted cameras differ: they are no pair")
+        raise CalibrationError(f"{folder}: the two undistorted cameras differ: they are not a pair")
     stereo = folder / "undistorted_calib_stereo.txt"
     pose = all_numbers(stereo, 16).reshape(4, 4)
     try:
@@ -969,7 +968,7 @@ def _fourseasons_cameras(path: Path) -> Cameras:
     x, y, z = between.translation.tolist()
     if between.angle_rad > _RECTIFIED_RAD or max(abs(y), abs(z)) > _RECTIFIED_M or x == 0:
         raise CalibrationError(
-            f"{stereo}: must be a shift along x alone, as of a rectified pair, not by "
+            f"{stereo}: must be a shift along x only, as for a rectified pair, not "
             f"({x:g}, {y:g}, {z:g}) m and {between.angle_rad:.3g} rad"
         )
     fx, fy, cx, cy = values[0].tolist()

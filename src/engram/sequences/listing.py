@@ -362,8 +362,8 @@ def usable_pairs(
             )
         why = f"; first fault: {reasons[0]}" if reasons else ""
         raise SequenceError(
-            f"{where}: no pair is left of {len(places)} in the drive, {len(chosen)} of them "
-            f"chosen{why}"
+            f"{where}: none of the {len(chosen)} chosen pairs can be used, of {len(places)} in "
+            f"the drive{why}"
         )
     return pairs, reasons
 

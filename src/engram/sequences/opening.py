@@ -230,7 +230,7 @@ def recognise(path: Path) -> str:
     if inside:
         named = "\n".join(f"  {drive}" for drive in inside[:_MOST_NAMED])
         more = f"\n  and {len(inside) - _MOST_NAMED} more" if len(inside) > _MOST_NAMED else ""
-        raise SequenceError(f"{path}: is not a drive but holds some; name one of\n{named}{more}")
+        raise SequenceError(f"{path}: is not a drive but contains some; name one of\n{named}{more}")
     raise SequenceError(
         _asked_of(path) or f"{path}: not a drive of a known layout; known are\n{_known_layouts()}"
     )

@@ -530,10 +530,10 @@ def faults(
     """Inject faults into drives; count false fixes.
 
     Localises clips (python -m engram_lab.studies.faults.clips renders them; ENGRAM_DATA names
-    real ones) in maps of other days, and maps them on. The same command resumes a run that
-    was stopped; each version of the method has a file of its own. With --only a question is
-    asked instead: robots that are misplaced, maps that are merged, cameras that are mounted
-    otherwise. A wrong name lists the questions.
+    real ones) in maps of other days, and adds them to these maps. The same command resumes a run
+    that was stopped; each version of the method has a file of its own. --only also takes
+    questions: misplaced robots, merged maps, differently mounted cameras, and others. An
+    unknown name lists the questions.
 
     \b
     Examples:
@@ -733,11 +733,11 @@ def public(
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Evaluate a public data set; one page comes out.
+    """Evaluate a public data set, and write one page.
 
-    Protocol and settings are those of the program: the first drive is mapped, each later one is
-    localised in its map and in one of all drives before. Of KITTI: odometry and loops. The same
-    command resumes. docs/datasets.md says where the sets are.
+    Protocol and settings are fixed: the first drive is mapped, each later one is localised in its
+    map and in one of all earlier drives. For KITTI: odometry and loops. The same command resumes.
+    docs/datasets.md says where the sets are.
 
     \b
     Examples:
@@ -766,7 +766,7 @@ def peers(
     ] = 2,
     as_json: options.Json = False,
 ) -> None:
-    """Compare Engram with other systems on equal drives.
+    """Compare Engram with other systems on the same drives.
 
     Ten drives of a small simulated town, and the real clips that ENGRAM_DATA names: Engram with
     both kinds of features, and SIFT, VLAD and PnP as in hloc, where pycolmap is installed. The

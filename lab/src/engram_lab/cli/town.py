@@ -31,7 +31,7 @@ def demo(
 ) -> None:
     """Drive a small simulated town with three robots.
 
-    Two robots map it and hand in their maps; a later drive by night and a third robot are localised
+    Two robots map it and hand in their maps; a later drive at night and a third robot are localised
     with what they share. Writes DIR/report.html, and opens it where there is a screen.
 
     \b
@@ -127,7 +127,7 @@ def simulate(
 ) -> None:
     """Render drives through a simulated town.
 
-    The exact poses are written beside each drive. The same command resumes a run that was stopped.
+    The exact poses are written next to each drive. The same command resumes a run that was stopped.
 
     \b
     Examples:

@@ -50,7 +50,7 @@ def enrol(
 ) -> None:
     """Enrol this robot with a centre.
 
-    The robot makes a key, which never leaves FOLDER.
+    The robot generates a key, which never leaves FOLDER.
 
     \b
     Examples:
@@ -180,7 +180,7 @@ def drove(
 ) -> None:
     """Report how well the map localised a drive.
 
-    A map that served badly is replaced by the last good one.
+    A map that localised badly is replaced by the last good one.
 
     \b
     Examples:
@@ -217,7 +217,7 @@ def _status_lines(found: dict[str, Any], folder: Path) -> list[str]:
         ready = f"revision {_revision(found['staged'])} is ready"
         lines.append(f"{ready}: when the robot is parked, engram agent switch {folder}")
     if found["rejected"]:
-        lines.append(f"revision {_revision(found['rejected'])} served badly and is not taken again")
+        lines.append(f"revision {_revision(found['rejected'])} localised badly and is not reused")
     if found["share"] is not None:
         share, driven_m = found["share"], found["driven_m"] or 0.0
         lines.append(f"with it {share:.0%} of the frames localised over {driven_m:.0f} m")

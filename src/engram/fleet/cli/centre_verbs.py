@@ -154,9 +154,9 @@ def dream(
     ] = None,
     as_json: options.Json = False,
 ) -> None:
-    """Ask for a dream, for whenever no robot waits.
+    """Request a dream, to run when no robot waits.
 
-    It looks for a better map in what robots handed in, judged by the map's held-out drives. The
+    It searches what robots handed in for a better map, judged on the map's held-out drives. The
     same command prints the outcome.
 
     \b
@@ -350,7 +350,7 @@ def token(
 
 
 def sweep(folder: Folder) -> None:
-    """Remove parts that nothing needs any more.
+    """Remove parts that are no longer needed.
 
     Parts that no hand-in and no download refers to are marked, and deleted by the next sweep.
     Workers sweep once a day by themselves.

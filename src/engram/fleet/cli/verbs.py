@@ -288,7 +288,7 @@ def build(
 ) -> None:
     """Map many drives in parallel.
 
-    Groups of drives are mapped side by side, then merged. Progress is kept in FLEET.build until
+    Groups of drives are mapped in parallel, then merged. Progress is kept in FLEET.build until
     the build is complete; the same command resumes an interrupted build. The same drives and
     options give the same map. Drives that FLEET already contains are left out.
 
@@ -400,7 +400,7 @@ def dream(
     settings: options.SettingsGiven,
     as_json: options.Json = False,
 ) -> None:
-    """Optimise a fleet map by held-out drives.
+    """Optimise a fleet map on held-out drives.
 
     Merges the robots' maps again, in other orders and with other settings, and compares the results
     on held-out drives. If the drives then localise significantly better, what is new in the best
@@ -444,35 +444,39 @@ def forget(
     region: Annotated[
         str | None,
         typer.Option(
-            "--region", metavar="X,Y,R", help="What lies R metres around a point of the map frame."
+            "--region",
+            metavar="X,Y,R",
+            help="What lies within R metres of a point in the map frame.",
         ),
     ] = None,
     older_than: Annotated[
         str | None,
-        typer.Option("--older-than", metavar="AGE", help="Drives of that age: 90d."),
+        typer.Option("--older-than", metavar="AGE", help="Drives older than this: 90d."),
     ] = None,
     down_to: Annotated[
         str | None,
         typer.Option(
-            "--down-to", metavar="SIZE", help="Only what serves least, until 2GB or 50% are left."
+            "--down-to",
+            metavar="SIZE",
+            help="Only the least useful nodes, until 2GB or 50% is left.",
         ),
     ] = None,
     pictures: Annotated[
-        bool, typer.Option("--pictures", help="Only the pictures of all this.")
+        bool, typer.Option("--pictures", help="Only the pictures of what is chosen.")
     ] = False,
     erase: Annotated[
-        bool, typer.Option("--erase", help="Erase all that is forgotten, permanently.")
+        bool, typer.Option("--erase", help="Permanently erase all that is forgotten.")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="Do it; without, it is previewed.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do it; the default is a preview.")] = False,
     message: Message = "",
     as_json: options.Json = False,
 ) -> None:
     """Forget drives, places or pictures.
 
-    What all the options hold for is hidden by a revision, which engram revert can undo, and is not
-    taken in again by merges. Edges are composed over it. Robots forget it with their next download.
-    --erase removes the bytes of all that is forgotten, whenever that was; receipts stay, by which
-    engram check still verifies the history. Close the map everywhere else first.
+    Hides what matches all the options, in a revision that engram revert can undo. Edges are
+    composed over it, merges do not add it again, and robots drop it with their next download.
+    --erase removes the bytes of everything forgotten so far; receipts stay, by which engram check
+    still verifies the history. Close the map everywhere else first.
 
     \b
     Examples:

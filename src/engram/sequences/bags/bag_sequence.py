@@ -346,7 +346,7 @@ class BagSequence:
         if not used:
             why = f"; {self.skipped_reasons[0]}" if self._reasons else ""
             raise SequenceError(
-                f"{self._bag.path}: no pair can be used of {self.pairing.left} left and "
+                f"{self._bag.path}: no usable pair among {self.pairing.left} left and "
                 f"{self.pairing.right} right images{why}"
             )
 

@@ -467,7 +467,7 @@ class Ros1Bag:
     def _indexed(self, file: BinaryIO) -> dict[str, Topic]:
         header, _ = _record(file)
         if header.get(b"op") != bytes([_BAG]):
-            raise DamageError("begins with something else than a bag header")
+            raise DamageError("does not begin with a bag header")
         file.seek(_number(header, b"index_pos", "<Q"))
         if file.tell() == 0:
             raise DamageError("was not closed")
@@ -802,7 +802,7 @@ class Bag:
                 self.note(str(error))
         if not self.topics:
             facts = f": {self.lost[0]}" if self.lost else ""
-            raise SequenceError(f"{path}: holds no message that can be read{facts}")
+            raise SequenceError(f"{path}: holds no readable message{facts}")
 
     @property
     def is_ros1(self) -> bool:

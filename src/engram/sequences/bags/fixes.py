@@ -52,7 +52,7 @@ def read_fixes(path: Path, topic: str | None = None) -> list[Fix]:
     fixes = {fix.time_ns: fix for fix in fixes_of(bag, named, Decoder(bag.is_ros1))}
     if not fixes:
         facts = f"; {bag.lost[0]}" if bag.lost else ""
-        raise InputError(f"{path}: {named} holds no fix: every message says so{facts}")
+        raise InputError(f"{path}: {named} holds no fix: all its messages report none{facts}")
     return [fixes[time_ns] for time_ns in sorted(fixes)]
 
 

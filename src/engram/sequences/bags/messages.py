@@ -324,7 +324,7 @@ def read_cameras(
     left, right = infos
     if (left.width, left.height) != size:
         raise CalibrationError(
-            f"{bag.path}: the CameraInfo of the left camera is of {left.width}×{left.height} "
+            f"{bag.path}: the CameraInfo of the left camera is for {left.width}×{left.height} "
             f"px, the images of {stereo.left} are {size[0]}×{size[1]}: give the calibration of "
             f"these images with --calibration FILE{scaled_by((left.width, left.height), size)}"
         )

@@ -53,7 +53,7 @@ def open_framelog(path: Path, options: OpenOptions) -> FrameLog:
     """A frame log as a drive; `FrameLog` lists other errors."""
     if options.channel is not Channel.GREY:
         raise ConfigError(
-            f"{path}: a frame log has no images to take channel {options.channel.value!r} of; "
+            f"{path}: a frame log has no images with a channel {options.channel.value!r}; "
             "choose the channel when recording it"
         )
     for option, value in (
@@ -109,7 +109,7 @@ class FrameLog:
         ]
         if not self._numbers:
             raise SequenceError(
-                f"{self._path}: no frame is chosen of the {len(stamps_ns)} in the log "
+                f"{self._path}: none of the {len(stamps_ns)} frames in the log is chosen "
                 f"(frames {options.frames})"
             )
         at_ns = options.recorded_at_ns
