@@ -82,16 +82,16 @@ class WeakSpotsConfig:
         float, Meta(gt=0, description="m that a drive was lost over which a miss decays e-fold")
     ] = 50.0
     alike_h: Annotated[
-        float, Meta(gt=0, description="standard deviation of alike hours, the night left out")
+        float, Meta(gt=0, description="standard deviation of similar hours, the night excepted")
     ] = 1.25
     alike_deg: Annotated[
-        float, Meta(gt=0, description="that of alike heights of the sun, from dusk to a high sun")
+        float, Meta(gt=0, description="the same of the sun's height, from dusk to a high sun")
     ] = 5.0
     unknown: Annotated[
-        float, Meta(gt=0, lt=1, description="share missed where nothing like it was driven, u")
+        float, Meta(gt=0, lt=1, description="share missed where no similar drive exists, u")
     ] = 0.2
     prior_drives: Annotated[float, Meta(gt=0, description="weight of that share, a, drives")] = 0.5
-    mending: Annotated[float, Meta(gt=0, description="like drives before the first one, e")] = 0.05
+    mending: Annotated[float, Meta(gt=0, description="similar drives assumed at first, e")] = 0.05
     weak_counts: Annotated[
         float, Meta(ge=0, le=1, description="share of a miss for which a weak match counts")
     ] = 0.1

@@ -224,8 +224,8 @@ class DoctorConfig:
 
     Attributes:
         frames: frames that are examined at the start of a drive; 0 turns the doctor off.
-        every: left and right are matched in every so many-th of them.
-        least_frames: fewest frames of which anything is said.
+        every: left and right are matched in every n-th of them.
+        least_frames: fewest frames for a verdict.
         negative_share: largest share of left-right matches that lie to the right in the right
             image. Healthy drives stay below 0.2, swapped sides above 0.8.
         upright: least logarithm of how much further up than down the scene reaches.
@@ -238,7 +238,7 @@ class DoctorConfig:
         equal_share: share of equal pixels of an image that repeats the one before.
         fixed_share: share of the image that may move with the camera.
         doubted: share of the frames at which part of the image may stand still without a reason.
-        gap_ratio: longest interval between frames, in those around it.
+        gap_ratio: longest interval between frames, as a multiple of those around it.
         faulty_share: share of the drive's frames that are left out for a wrong stamp.
         jump_s: interval that is a step of the clock, not a gap, s.
         least_rate_hz: slower cameras give odometry no prediction.
@@ -252,7 +252,7 @@ class DoctorConfig:
         least_disparity_px: median disparity of the landmarks, px: below it depth is a guess.
         scale: difference of odometry's scale from that of motion from outside, and of focal length
             or baseline from what fits a map, as a share.
-        turn_ratio: turn by gyroscope or wheels over that which odometry sees; degrees have 57.
+        turn_ratio: turn by gyroscope or wheels over that by odometry; degrees give 57.
         bits: bits of the brightest pixel of 16-bit images.
         other_size: distance of the principal point from the middle, both down and right, or both
             up and left, in half images. Real calibrations stay below 0.1; half images with the

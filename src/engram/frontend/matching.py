@@ -102,8 +102,8 @@ class MatcherConfig:
         int,
         Meta(
             ge=1,
-            description="most triples of matches aligned: what an attempt costs of which nothing "
-            "comes. Source: lab/reports/performance.md",
+            description="most triples of matches aligned; bounds the cost of a failed attempt. "
+            "Source: lab/reports/performance.md",
         ),
     ] = 512
     max_hypotheses: Annotated[int, Meta(ge=1, description="most of them refined")] = 250

@@ -56,7 +56,7 @@ class BasinConfig:
     ] = 10.0
     success_at_zero: Annotated[
         float,
-        Meta(gt=BASIN_LEVEL, lt=1, description="success rate at zero offset, alike in appearance"),
+        Meta(gt=BASIN_LEVEL, lt=1, description="success rate at zero offset, similar appearance"),
     ] = 0.97
     softness: Annotated[
         float, Meta(gt=0, description="steepness of the prior, as a share of the basin")

@@ -108,8 +108,8 @@ class LocaliserConfig:
         greatest_gap_m: largest standard deviation of motion that odometry did not measure. Beyond
             it since the last match or saved node the robot is lost; beyond it in one gap an
             experience ends.
-        followed_gap_m: largest standard deviation of motion, guessed or measured, along which what
-            speaks for places of a lost robot is carried on.
+        followed_gap_m: largest standard deviation of motion, guessed or measured, along which a
+            lost robot's evidence for places is propagated.
         guide_below_m, guide_below_rad: the prediction guides an attempt if its standard deviations
             are below both; 0 turns guidance off. Source: `lab/reports/constants.md`.
         lost_max_samples, lost_max_hypotheses: the matcher's bounds for attempts of a lost robot.

@@ -60,12 +60,12 @@ class FixedConfig:
         Meta(
             gt=1,
             description="least distance, px, by which the others' motion would have moved a "
-            "landmark that kept its pixel, for it to defy that motion",
+            "landmark that kept its pixel, for it to contradict that motion",
         ),
     ] = 4.0
     defying: Annotated[
         float,
-        Meta(gt=0, lt=1, description="least share of the landmarks that defy a motion together"),
+        Meta(gt=0, lt=1, description="least share of landmarks that contradict a motion together"),
     ] = 0.03
     others: Annotated[
         int, Meta(ge=6, description="fewest landmarks that agree on the others' motion")
@@ -78,8 +78,8 @@ class FixedConfig:
         float,
         Meta(
             gt=1,
-            description="ratio of moving to defying landmarks, or the reverse, from which the "
-            "larger group is the world",
+            description="ratio of moving to contradicting landmarks, or the reverse, from which "
+            "the larger group is the world",
         ),
     ] = 2.0
     one_depth: Annotated[
@@ -109,13 +109,13 @@ class FixedConfig:
         float, Meta(gt=0, description="votes after which a cell is fixed to the camera")
     ] = 2.5
     most_votes: Annotated[
-        float, Meta(gt=0, description="most votes of a cell, so that past things are forgotten")
+        float, Meta(gt=0, description="most votes of a cell, so that removed objects fade")
     ] = 6.0
     weak_votes: Annotated[
         float, Meta(gt=0, description="votes after which a cell next to a fixed one is fixed, too")
     ] = 0.9
     forgets: Annotated[
-        float, Meta(gt=0, lt=1, description="share of the votes that is forgotten at each look")
+        float, Meta(gt=0, lt=1, description="share of its votes that a cell loses at each look")
     ] = 0.03
     least_share: Annotated[
         float,

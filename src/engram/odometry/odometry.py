@@ -91,8 +91,8 @@ class OdometryConfig:
         braking_m_s2: a step that takes more than half of the speed, faster than this since the last
             step that was not vague, is an impossible stop. A car brakes with up to 8.
         braking_share: what `steady_share` is against an impossible stop.
-        disbelief_s: so long after one the speed before it is still the last speed, and the step's
-            covariance holds both. No robot keeps its speed for much longer.
+        disbelief_s: time after one for which the earlier speed stays the last speed, and the step's
+            covariance covers both. No robot keeps its speed for much longer.
         keyframe_flow_px: a frame becomes a keyframe once its landmarks have moved this far in the
             image (median). Below it noise outweighs motion.
         keyframe_share: or once it shows less than this share of the keyframe's landmarks.

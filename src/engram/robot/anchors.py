@@ -661,7 +661,7 @@ class IslandsConfig:
 
     Attributes:
         sigmas: nodes are compared up to so many standard deviations of their parts' anchors.
-        reach_m: and so much farther, as views match that lie apart.
+        reach_m: and this much farther, as separate views match, too.
         turn_rad: largest difference of their headings.
         nearest: nodes of the other part that each node is compared with.
         attempts: most matches that are tried between two parts.

@@ -54,7 +54,7 @@ class MergeSettings:
             input gives the same map.
     """
 
-    ranking: Annotated[str, Meta(description="key of POLICIES"), PUBLIC] = "recall"
+    ranking: Annotated[str, Meta(description="as drive.ranking"), PUBLIC] = "recall"
     lanes: Annotated[int, Meta(ge=1, description="attempts in parallel, Np"), PUBLIC] = 2
     rounds: Annotated[int, Meta(ge=1, description="rounds of attempts for a frame, Nr"), PUBLIC] = 4
     relocaliser: Annotated[
