@@ -57,8 +57,47 @@ def test_a_part_that_begins_after_a_silence_is_announced(capsys):
         monitor.advance()
     assert capsys.readouterr().err.splitlines() == [
         "simulate: 0 of 6",
-        "simulate: 1 of 6, 50 s left",
+        "simulate: 1 of 6",
     ]
+
+
+def test_a_slow_first_item_does_not_count_in_the_time_left(capsys):
+    """The first waits for what is built once: 50 s, where the others take half a second."""
+    clock = Clock()
+    with Bars(clock).stage("simulate", 101) as monitor:
+        clock.now_s += 50.0
+        monitor.advance()
+        for _ in range(40):
+            clock.now_s += 0.5
+            monitor.advance()
+    assert capsys.readouterr().err.splitlines() == [
+        "simulate: 1 of 101",
+        "simulate: 21 of 101, 40 s left",
+        "simulate: 41 of 101, 30 s left",
+    ]
+
+
+def test_items_of_an_earlier_run_do_not_count_in_the_time_left(capsys):
+    clock = Clock()
+    with Bars(clock).stage("simulate", 100) as monitor:
+        for _ in range(60):
+            monitor.advance()
+        for _ in range(10):
+            clock.now_s += 2.0
+            monitor.advance()
+    assert capsys.readouterr().err.splitlines() == [
+        "simulate: 65 of 100, 70 s left",
+        "simulate: 70 of 100, 60 s left",
+    ]
+
+
+def test_the_time_left_follows_a_change_of_pace(capsys):
+    clock = Clock()
+    with Bars(clock).stage("map", 400) as monitor:
+        for seconds in [0.5] * 100 + [2.0] * 50:
+            clock.now_s += seconds
+            monitor.advance()
+    assert capsys.readouterr().err.splitlines()[-1] == "map: 150 of 400, 500 s left"
 
 
 def test_a_terminal_gets_a_bar_and_no_lines(monkeypatch):

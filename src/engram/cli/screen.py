@@ -11,6 +11,7 @@ import io
 import os
 import sys
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -117,6 +118,45 @@ def drawing(stream: TextIO) -> TextIO:
 
 # Seconds between two lines in a log: work that is done sooner leaves none.
 EVERY_S = 10.0
+# The time left follows from the pace of so many last seconds, once so many items and seconds are
+# known of it.
+_PACE_S, _LEAST_ITEMS, _LEAST_S = 30.0, 3, 2.0
+
+
+class Pace:
+    """How fast items have been finished lately.
+
+    The first one, and those within a second of it, only start the clock: the first waits for what
+    is loaded or built once, and the others may have been finished by an earlier run.
+    """
+
+    def __init__(self) -> None:
+        self._done = 0
+        # Time, s, and number of finished items, at most one entry a second.
+        self._marks: deque[tuple[float, int]] = deque()
+        self._first_s = 0.0
+
+    def advance(self, now_s: float) -> None:
+        """Counts an item finished at a time, s."""
+        self._done += 1
+        if not self._marks:
+            self._first_s = now_s
+        if now_s - self._first_s < 1.0:
+            self._marks.clear()
+        if not self._marks or now_s - self._marks[-1][0] >= 1.0:
+            self._marks.append((now_s, self._done))
+        while len(self._marks) > 2 and now_s - self._marks[1][0] >= _PACE_S:
+            self._marks.popleft()
+
+    def left_s(self, remaining: int, now_s: float) -> float | None:
+        """Seconds for the remaining items at this pace; None while too little is known."""
+        if not self._marks:
+            return None
+        then_s, before = self._marks[0]
+        items, took_s = self._done - before, now_s - then_s
+        if items < _LEAST_ITEMS or took_s < _LEAST_S:
+            return None
+        return took_s * remaining / items
 
 
 class Bars(Monitor):
@@ -141,19 +181,21 @@ class Bars(Monitor):
 
     def _lines(self, what: str, total: int) -> Callable[[str], None]:
         """Announces a part of the work; what is called once per item."""
-        begun_s, done = self._clock(), 0
+        pace, done = Pace(), 0
 
         def write(words: str) -> None:
             now_s = self._clock()
             if now_s - self._written_s < EVERY_S:
                 return
             self._written_s = now_s
-            left = f", {(now_s - begun_s) * (total - done) / done:.0f} s left" if done else ""
+            left_s = pace.left_s(total - done, now_s)
+            left = "" if left_s is None else f", {left_s:.0f} s left"
             print(f"{what}: {done} of {total}{left}{words}", file=sys.stderr, flush=True)
 
         def advance(word: str) -> None:
             nonlocal done
             done += 1
+            pace.advance(self._clock())
             write(f", {word}" if word else "")
 
         write("")
