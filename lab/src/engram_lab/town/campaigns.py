@@ -66,6 +66,7 @@ class SessionPlan:
         lens: what is wrong with the front lens.
         beside: driven along the route beside the campaign's.
         rain_mm_h: mean rate on the drive; None for the weather's own.
+        night_in_name: whether the name of a night drive has `night` in place of its weather.
     """
 
     number: int
@@ -77,18 +78,24 @@ class SessionPlan:
     lens: Lens = CLEAN
     beside: bool = False
     rain_mm_h: float | None = None
+    night_in_name: bool = False
 
     @property
     def name(self) -> str:
         """Such as ``007-0812T0930-overcast-wildcat``."""
         way = ("-reverse" if self.reverse else "") + ("-beside" if self.beside else "")
-        return f"{self.number:03d}-{self.start:%m%dT%H%M}-{self.weather}-{self.robot}{way}"
+        seen = self._night_or_weather if self.night_in_name else self.weather
+        return f"{self.number:03d}-{self.start:%m%dT%H%M}-{seen}-{self.robot}{way}"
 
     @property
     def words(self) -> str:
         """Such as ``Tue 09:30, overcast``, for people; a night by its name, whatever its sky."""
+        return f"{self.start:%a %H:%M}, {self._night_or_weather}"
+
+    @property
+    def _night_or_weather(self) -> str:
         night = self.start.hour >= _NIGHT_H or self.start.hour < _MORNING_H
-        return f"{self.start:%a %H:%M}, {'night' if night else self.weather}"
+        return "night" if night else self.weather
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +117,8 @@ class Campaign:
         begins_m: way along the route to the first frame.
         place: where on earth.
         fronts: how the fronts repeat; None where each is unique.
+        town_in_names: whether the names of its robots in logs contain town and seed, so that the
+            robots of two towns differ (method §2.7).
         first_day: from which structural change counts.
     """
 
@@ -126,6 +135,7 @@ class Campaign:
     begins_m: float = 0.0
     place: Place = OXFORD
     fronts: Fronts | None = None
+    town_in_names: bool = True
 
     @property
     def first_day(self) -> int:

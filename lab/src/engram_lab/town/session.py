@@ -182,16 +182,14 @@ class SimulatedSequence:
 
     @property
     def info(self) -> SequenceInfo:
-        """Facts about the drive as a whole; campaign and seed are part of the robot's name.
-
-        They stand for the robot's identity (method §2.7): wildcats of two towns are two robots.
-        """
+        """Facts about the drive as a whole; see `Campaign.town_in_names`."""
         campaign, plan = self._drive.campaign, self._drive.plan
+        town = f"@{campaign.home}-{campaign.seed}" if campaign.town_in_names else ""
         return SequenceInfo(
             name=plan.name,
             format="simulated",
             clock=Clock.UTC,
-            robot=f"{plan.robot}@{campaign.home}-{campaign.seed}",
+            robot=f"{plan.robot}{town}",
             longitude_deg=campaign.place.longitude_deg,
         )
 
