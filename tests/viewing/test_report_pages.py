@@ -102,6 +102,19 @@ def test_a_strip_has_the_runs_and_gaps_of_a_drive() -> None:
     assert "<svg" in as_svg(draw_strip(empty), "an empty drive")
 
 
+def test_a_drive_has_its_colour_of_the_map_unless_two_share_it() -> None:
+    localised, places_m = np.ones(2, bool), np.zeros((2, 2))
+    course = Course(np.array([1.0, 2.0]), ["b", "c"], np.ones(2), localised, places_m)
+
+    def colours(known: dict[str, str]) -> list[str]:
+        _, sure = draw_strip(course, known).axes
+        return [line.get_color() for line in sure.lines]
+
+    assert colours({"a": PALETTE[0], "b": PALETTE[3], "c": PALETTE[5]}) == [PALETTE[3], PALETTE[5]]
+    assert colours({"b": PALETTE[3], "c": PALETTE[3]}) == [PALETTE[0], PALETTE[1]]
+    assert colours({"b": PALETTE[1]}) == [PALETTE[0], PALETTE[1]]
+
+
 def test_frames_without_a_match_have_no_colour_of_a_drive() -> None:
     """With as many drives as there are colours: hatching and marks tell the others apart."""
     from matplotlib.colors import to_hex

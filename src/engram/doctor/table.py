@@ -300,7 +300,8 @@ CHECKS: tuple[Check, ...] = (
     Check(
         "low_frame_rate", _WARNING, checks.rate_hz, "least_rate_hz", "Hz",
         "few frames per second: odometry has no prediction from one to the next",
-        "record with at least 4 Hz, better 10; or are the stamps in milliseconds, not seconds?",
+        "record with at least 4 Hz, better 10; or are the time stamps in milliseconds, not "
+        "seconds?",
         below=True,
     ),
     Check(

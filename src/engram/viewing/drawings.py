@@ -403,10 +403,12 @@ class MapParts:
     Attributes:
         above: the map.
         panels: the largest parts, one panel each.
+        colours: of the labels, by name.
     """
 
     above: MapAbove
     panels: list[Panel]
+    colours: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def nodes(self) -> int:
@@ -450,7 +452,8 @@ def parts_of(opened: Map, by: str = "experience", title: str = "") -> MapParts:
         )
         for number, size in enumerate(sizes[:_PARTS])
     ]
-    return MapParts(above, panels or [Panel(title, [])])
+    colours = dict(zip(labels.names, labels.colours, strict=True))
+    return MapParts(above, panels or [Panel(title, [])], colours)
 
 
 def _tracks(above: MapAbove, labels: Labels, chosen: NDArray[np.bool_]) -> list[Track]:
@@ -576,11 +579,18 @@ class Course:
         return [(a, b) for a, b in pairwise(marks) if b > a]
 
 
-def draw_strip(course: Course) -> Any:
-    """A drive over its distance: which drive's nodes it matched, and how surely."""
+def draw_strip(course: Course, known: Mapping[str, str] | None = None) -> Any:
+    """A drive over its distance: which drive's nodes it matched, and how surely.
+
+    Args:
+        known: colours of a map's drives, by name; not used where two of the drives share one.
+    """
     figure, (band, sure) = subplots(2, width=_WIDTH_IN, height=3.6, rows=2)
     names = sorted(set(course.names) - _HATCHES.keys())
     colours = {name: PALETTE[number % len(PALETTE)] for number, name in enumerate(names)}
+    as_known = {name: colour for name, colour in (known or {}).items() if name in colours}
+    if len(set(as_known.values())) == len(names):
+        colours = as_known
     for name, first, last in course.runs():
         start_m = float(course.at_m[first - 1]) if first else 0.0
         width_m = max(float(course.at_m[last]) - start_m, 1e-3)
@@ -610,7 +620,7 @@ def draw_strip(course: Course) -> Any:
         sure.legend(
             fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.2
         )
-    sure.set_title("Confidence of the best attempt: log-odds that it is right", fontsize=10)
+    sure.set_title("Confidence of the best attempt", fontsize=10)
     sure.set_xlabel("distance driven, m", fontsize=9)
     end_m = float(course.at_m[-1]) if len(course.at_m) else 1.0
     for axes in (band, sure):
@@ -639,7 +649,7 @@ def _legend_below(axes: Any) -> None:
 
 
 def draw_course(parts: MapParts, course: Course) -> Any:
-    """A map from above in grey, and over it where a drive was localised."""
+    """A map from above, and over it where a drive was localised."""
     from scipy.spatial import cKDTree  # verbs that draw nothing import this module, too
 
     known = np.asarray(np.isfinite(course.places_m).all(axis=1), bool)
@@ -649,14 +659,13 @@ def draw_course(parts: MapParts, course: Course) -> Any:
         of[known] = parts.above.part[nearest]
     panels = []
     for number, panel in enumerate(parts.panels):
-        grey = [replace(track, label="", colour=_FEW) for track in panel.tracks]
         driven = [
-            Track(label, course.places_m[chosen], colour, mark=mark)
-            for label, colour, mark, which in (
-                ("localised", GOOD, ".", course.localised),
-                ("not localised", _INK, "x", ~course.localised),
+            Track(label, course.places_m[chosen], _INK, mark=mark)
+            for label, mark, which in (
+                ("localised", ".", course.localised),
+                ("not localised", "x", ~course.localised),
             )
             if np.any(chosen := np.asarray(which & (of == number), bool))
         ]
-        panels.append(replace(panel, tracks=[*grey, *driven]))
+        panels.append(replace(panel, tracks=[*panel.tracks, *driven]))
     return draw_parts(panels)

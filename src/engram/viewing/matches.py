@@ -137,7 +137,8 @@ class MatchShower:
         self, opened: Map, robot: Robot, session: Session, images: Images | None = None
     ) -> None:
         self._opened, self._graph = opened, robot.graph
-        self._acceptance = robot.in_force.config.acceptance
+        in_force = robot.in_force
+        self._acceptance, self._lanes = in_force.config.acceptance, in_force.budget.lanes
         self._session, self._images = session, images or NoImages()
 
     def show(
@@ -165,7 +166,9 @@ class MatchShower:
     def _details(self, seen: LastFrame, found: Localisation, best: Outcome, mapped_by: str) -> str:
         mapped, drives = map(printable, (mapped_by, self._session.robot))
         who = f"mapped by {mapped}, driven by {drives}" if mapped != drives else f"robot {drives}"
-        attempt = f"attempt {best.rank + 1} of {len(seen.outcomes)} made"
+        attempt = f"attempt {best.rank + 1} of {len(seen.outcomes)}"
+        if min(self._lanes, len(seen.outcomes)) > 1:
+            attempt += f", {self._lanes} at a time"
         if found.localised:
             judged = f"confidence {best.confidence:.1f}"
         else:

@@ -28,6 +28,7 @@ from engram.viewing.drawings import (
     NOWHERE,
     UNMEASURED,
     Course,
+    MapParts,
     as_svg,
     draw_course,
     draw_parts,
@@ -54,10 +55,12 @@ from engram.weak_spots import WeakSpots, WeakSpotsConfig, find_weak_spots
 _LOCALISED = (
     "Localised: the frame matched a node, a saved frame of the map, and the camera's pose in it is "
     "known. By odometry alone: carried on from the last match. Lost: too far from it, so places "
-    "that look alike are tried all over the map. A confidence of 4.6 is one wrong match in a "
-    "hundred."
+    "that look alike are tried all over the map. Confidence: the higher, the surer."
 )
-_EXAMINED = "It checks the camera, its calibration, the stamps and odometry, and nothing else."
+_EXAMINED = (
+    "engram doctor checks the camera, its calibration, the time stamps and odometry, and nothing "
+    "else."
+)
 # Pictures of each kind, and the distance between the frames that they show, metres.
 _PICTURES, _APART_M = 3, 8.0
 # Revisions and drives that a page lists.
@@ -147,7 +150,8 @@ class Showcase:
         else:
             points = (
                 "Points of one colour are one landmark in both, an inlier: it agrees with the "
-                "pose. Lines join a few of them."
+                "pose. Lines join a few of them. Ahead, behind, right, left: of the node's camera. "
+                f"Of frames within {_APART_M:.0f} m of each other one is shown."
             )
             parts.insert(1, paragraph(points, "muted"))
         return parts
@@ -171,9 +175,11 @@ def drive_page(
         f"{summary.share_localised:.0%} of the frames, longest stretch between matches "
         f"{summary.longest_gap_m:.1f} m"
     )
-    sections += [heading("The drive"), drawing(as_svg(draw_strip(course), about), _LOCALISED)]
-    if opened is not None:
-        sections += _map_sections(opened, course)
+    parts = None if opened is None else parts_of(opened, title=Path(opened.location).name)
+    strip = draw_strip(course, {} if parts is None else parts.colours)
+    sections += [heading("The drive"), drawing(as_svg(strip, about), _LOCALISED)]
+    if opened is not None and parts is not None:
+        sections += _map_sections(opened, parts, course)
     if showcase is not None:
         sections += showcase.section()
     alarms = [one for one in summary.findings if one.severity is not Severity.NOTE]
@@ -235,17 +241,20 @@ def _drive_figures(summary: DriveSummary) -> list[tuple[str, str]]:
             for status, name in _UNMATCHED.items()
         ),
         ("unusable frames", f"{summary.unusable_frames}"),
-        ("fixes withdrawn", f"{summary.withdrawn}"),
+        ("matches withdrawn later", f"{summary.withdrawn}"),
         ("ms a frame, median", f"{total.get('median', 0.0):.1f}"),
-        ("ms a frame, 99 of 100", f"{total.get('p99', 0.0):.1f}"),
+        ("ms a frame, 99 % below", f"{total.get('p99', 0.0):.1f}"),
     ]
 
 
-def _map_sections(opened: Map, course: Course) -> list[str]:
-    parts = parts_of(opened, title=Path(opened.location).name)
+def _map_sections(opened: Map, parts: MapParts, course: Course) -> list[str]:
     about = f"The map from above, {counted(parts.nodes, 'node')}, and where the drive was localised"
     shown = drawing(
-        as_svg(draw_course(parts, course), about), parts.caption("Grey: the map's drives")
+        as_svg(draw_course(parts, course), about),
+        parts.caption(
+            "As the map estimates it. Points: the drive, where it is localised at the matched "
+            "nodes, else by odometry. Lines: the map's drives"
+        ),
     )
     served = Counter(course.names)
     rows = [

@@ -37,8 +37,8 @@ def _pinhole(
     return StereoCamera(focal, focal, *middle, baseline_m, width, height)
 
 
-# The town's default camera (512×384, 65° across, 0.24 m) on two robots, variants of it on others, and
-# KITTI's, for the calibration against its clip.
+# The town's default camera (512×384, 65° across, 0.24 m) on two robots, variants of it on others,
+# and KITTI's, for the calibration against its clip.
 ROBOTS: dict[str, Robot] = {
     robot.name: robot
     for robot in (
