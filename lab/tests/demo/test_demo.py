@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from uuid import UUID
 
 import cv2
 import numpy as np
@@ -13,13 +14,25 @@ from tests.pages import check_page
 import engram
 from engram.frontend.frontend import make_thumbnail
 from engram.geometry.se3 import SE3
+from engram.graph.model import CameraId, Clock, NodeId, Session, SessionId
 from engram.localiser.localisation import Localisation, LocalisationStatus
+from engram.robot.mapping import MapReport
 from engram.sample import drives
 from engram.viewing.drawings import map_above
 from engram_lab.demo.sample_drives import PARTS, encoded, write_facts
-from engram_lab.demo.story import Judged, Rendered, _why, demo_campaign, run_demo
+from engram_lab.demo.story import (
+    LIMITS,
+    DemoReport,
+    Judged,
+    LaterDrive,
+    MappedDrive,
+    Rendered,
+    _why,
+    demo_campaign,
+    run_demo,
+)
 from engram_lab.town.campaigns import campaign_named
-from engram_lab.town.session import SimulatedDrive
+from engram_lab.town.session import SimulatedDrive, SimulatedSequence
 
 SHIPPED = Path(drives.__file__).parent / "data"
 
@@ -90,19 +103,64 @@ def test_fixes_are_judged_by_the_truth() -> None:
     judged = Judged.of([*fixes, none], world_from_cam)
     assert judged.false == 2
     assert sorted(judged.error_m) == pytest.approx([0.0, 0.03, 2.0], abs=1e-9)
-    assert judged.text() == "median error 3.0 cm, 2 of 3 fixes false"
+    assert judged.text() == "median error 3.0 cm, 2 of 3 matches false"
     assert (judged + judged).false == 4
-    assert Judged.of([none], world_from_cam).text() == "median error – cm, 0 of 0 fixes false"
+    assert Judged.of([none], world_from_cam).text() == "median error – cm, 0 of 0 matches false"
 
 
-def test_the_demo_is_the_hamlet_with_a_second_night() -> None:
+def test_the_accuracy_counts_each_drive_once() -> None:
+    def run(drive: str, where: str, error_m: float, false: int) -> LaterDrive:
+        judged = Judged((error_m,) * 10, false)
+        return LaterDrive(drive, where, "recall", 4, {}, judged, 50.0, 1.0, {})
+
+    mapped = MappedDrive("monday", 0.5, 10, 0, "", 20, Judged((0.01,) * 10, 1))
+    own, fleet = run("night", "its own map", 0.2, 2), run("night", "the fleet's map", 0.03, 0)
+    other = run("night", "the fleet's map", 0.01, 4)
+    report = DemoReport(Path(), Path(), mapped=[mapped], shared=[own, fleet], ranked=[fleet, other])
+    assert "median error 2.0 cm, 1 of 20 matches false" in report.accuracy()
+    assert "all runs above: 7." in report.accuracy()
+
+
+def test_frames_that_add_nothing_are_accounted_for() -> None:
+    lost = Localisation(1, LocalisationStatus.LOST, 0, 0, 0.0)
+    kept = replace(lost, saved=NodeId(UUID(int=1)))
+    session = Session(
+        SessionId(UUID(int=2)), "wildcat", CameraId(UUID(int=3)), 0, Clock.RELATIVE, None
+    )
+    mapped = MapReport(session, results=[kept, kept, lost])
+    row = MappedDrive.of("monday", mapped, Judged((), 0), first=True).row()
+    assert row == ("monday", "0 of 3", "0", "2", "map was empty; 1 skipped")
+
+
+def test_the_demo_is_the_hamlet_with_a_second_night_and_scout() -> None:
     demo, hamlet = demo_campaign(), campaign_named("hamlet")
     assert [one.start for one in demo.sessions] == sorted(one.start for one in demo.sessions)
-    assert [a.name == b.name for a, b in zip(demo.sessions, hamlet.sessions, strict=True)] == [
-        True, True, True, True, False, True,
+    assert [a.seed for a in demo.sessions] == [b.seed for b in hamlet.sessions]
+    assert [one.name for one in demo.sessions] == [
+        "000-0714T0830-clear-wildcat", "001-0714T1700-clear-courier",
+        "002-0715T1100-overcast-wildcat", "003-0715T2230-night-wildcat",
+        "004-0716T2245-night-courier", "005-0717T0900-fair-scout",
     ]  # fmt: skip
+    assert hamlet.sessions[3].name == "003-0715T2230-fair-wildcat"
     assert demo.sessions[4].weather == demo.sessions[3].weather
     assert demo.first_day == hamlet.first_day
+
+
+def test_logs_name_their_robots_and_no_two_have_one_calibration() -> None:
+    """Equal calibrations count as one camera, whose disparities have one error."""
+    sequences = [SimulatedSequence(demo_campaign(), number) for number in range(6)]
+    cameras = {one.info.robot: one.camera for one in sequences}
+    assert cameras.keys() == {"wildcat", "courier", "scout"}
+    assert len(set(cameras.values())) == 3
+    assert SimulatedSequence(campaign_named("hamlet"), 0).info.robot == "wildcat@hamlet-1"
+
+
+def test_the_figures_of_real_images_are_those_of_the_docs() -> None:
+    evidence = (Path(__file__).parents[3] / "docs/evidence.md").read_text(encoding="utf-8")
+    rows = [line for line in evidence.splitlines() if line.startswith("|")]
+    for named in ("100 %, median error 1.05 cm", "97.6 % within 0.25 m"):
+        assert named in LIMITS
+        assert sum(named in row for row in rows) == 1
 
 
 def test_whole_images_are_rendered_when_they_are_asked_for() -> None:
@@ -137,8 +195,19 @@ def test_the_demo_shows_that_sharing_pays(tmp_path: Path) -> None:
         assert one.judged.false == 0
     with engram.open_map(report.out / "fleet.engram") as fleet:
         assert map_above(fleet).sizes() == [sum(report.taken.values())]
-    ranked = {(one.policy, one.attempts): one.summary for one in report.ranked}
-    assert ranked["recall", 4]["share_localised"] >= ranked["distance", 4]["share_localised"]
+    assert all(sum(one.matched.values()) == len(one.judged.error_m) for one in report.shared)
+    ranked = {(one.policy, one.attempts): one for one in report.ranked}
+    by_recall, by_distance = ranked["recall", 4], ranked["distance", 4]
+    assert by_recall is report.shared[1]
+    # What the words below the table say.
+    recall, distance = by_recall.summary, by_distance.summary
+    assert recall["share_localised"] > distance["share_localised"]
+    assert recall["attempts_per_frame"] < distance["attempts_per_frame"]
+    assert by_recall.node_m > by_distance.node_m
+    assert np.median(by_recall.judged.error_m) > np.median(by_distance.judged.error_m)
+    for table in report.tables():
+        widths = [max(map(len, column)) for column in zip(table.head, *table.rows, strict=True)]
+        assert sum(widths) + 2 * len(widths) <= 80
     read = check_page(report.page.read_text(), most_bytes=3_000_000)
     captions = [one["alt"] for one in read.of("img")]
     assert sum("inliers" in one for one in captions) >= 6

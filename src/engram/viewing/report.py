@@ -150,8 +150,8 @@ class Showcase:
         else:
             points = (
                 "Points of one colour are one landmark in both, an inlier: it agrees with the "
-                "pose. Lines join a few of them. Ahead, behind, right, left: of the node's camera. "
-                f"Of frames within {_APART_M:.0f} m of each other one is shown."
+                "pose. Lines join a few of them. Ahead, behind, right, left: where the robot is, "
+                f"seen from the node. Of frames within {_APART_M:.0f} m only one is shown."
             )
             parts.insert(1, paragraph(points, "muted"))
         return parts

@@ -37,16 +37,16 @@ def _pinhole(
     return StereoCamera(focal, focal, *middle, baseline_m, width, height)
 
 
-# The town's default camera (512×384, 65° across, 0.24 m) on two robots, variants of it on others,
-# and KITTI's, for the calibration against its clip.
+# The town's default camera (512×384, 65° across, 0.24 m), variants of it on other robots, and
+# KITTI's, for the calibration against its clip.
 ROBOTS: dict[str, Robot] = {
     robot.name: robot
     for robot in (
         Robot("wildcat", _pinhole(512, 384, 65, 0.24)),
-        Robot("scout", _pinhole(512, 384, 65, 0.24)),
         Robot(
             "courier", _pinhole(512, 384, 74, 0.16), height_m=1.15, pitch_rad=-0.03, vignette=0.2
         ),
+        Robot("scout", _pinhole(512, 384, 70, 0.2), height_m=1.3),
         Robot("bicycle", _pinhole(512, 384, 65, 0.24), height_m=1.3, shake=2.2, on_handlebars=True),
         Robot(
             "kitti",
