@@ -98,6 +98,39 @@ class World:
         return _random_descriptors(len(self.points), self.seed, appearance)
 
 
+# A front of `Copied`.
+_FRONT_M = 6.0
+
+
+class Sparse(World):
+    """A street of which a frame shows all that is in view."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.points = self.points[::4]
+
+
+class Copied(Sparse):
+    """A street that shares some of the points of another one, and looks of them to the bit.
+
+    It shares whole places, as equal fronts do, or here and there a point, as in rain.
+    """
+
+    def __init__(self, of: World, share: float, *, evenly: bool = False) -> None:
+        super().__init__(of.length_m, seed=of.seed)
+        other = Sparse(of.length_m, seed=of.seed + 100)
+        rng = np.random.default_rng(3)
+        place = np.unique(np.floor(self.points / _FRONT_M), axis=0, return_inverse=True)[1].ravel()
+        number = np.arange(len(self.points)) if evenly else place
+        self._same = rng.random(number.max() + 1)[number] < share
+        self._other = other
+        self.points = np.where(self._same[:, None], self.points, other.points)
+
+    def descriptors(self, appearance: int) -> np.ndarray:
+        own, other = super().descriptors(appearance), self._other.descriptors(appearance)
+        return np.where(self._same[:, None], own, other)
+
+
 @lru_cache(maxsize=8)
 def _random_descriptors(count: int, seed: int, appearance: int) -> np.ndarray:
     rng = np.random.default_rng([seed, appearance])

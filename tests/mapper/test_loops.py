@@ -2,17 +2,20 @@
 
 import threading
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.builders import Mapped, World, drive, map_simulated, see
+from tests.builders import Copied, Mapped, Sparse, World, drive, map_simulated, see
 
 from engram.errors import MapCorruptError
 from engram.geometry.se3 import SE3
 from engram.graph.model import Edge, EdgeKind
+from engram.mapper.loops import LoopConfig
 from engram.maps.frame_reader import FrameReader
 from engram.maps.map import Map
+from engram.robot import drive_session
 
 # A lap of 151 m with a step every 0.7 m: 0.17° a step too much is 37° and 17 m at its end.
 LAP_M = 2 * np.pi * 24.0
@@ -106,6 +109,25 @@ def test_a_place_that_looks_like_another_one_closes_no_loop(path: Path, alike_m:
     mapped = map_simulated(path, seen_again, closes_loops=True)
     assert loop_edges(path, mapped) == []
     assert "localised" not in mapped.statuses
+
+
+@pytest.mark.parametrize(("own_share", "closes"), [(1e-9, True), (LoopConfig().own_share, False)])
+def test_a_street_that_shares_a_third_with_one_before_it_closes_no_loop_with_it(
+    path: Path, monkeypatch: pytest.MonkeyPatch, own_share: float, closes: bool
+) -> None:
+    """Nothing excuses the missing two thirds within one drive: it is neither darker nor wet."""
+    monkeypatch.setattr(drive_session, "LoopConfig", partial(LoopConfig, own_share=own_share))
+    road = Sparse(190.0, seed=6)
+    copy = Copied(road, 0.35, evenly=True)
+    driven = drive(road, np.arange(0.0, 190.0, 0.7))
+    seen_again = [
+        replace(seen, frame=see(copy, copy.pose_at(s - 100.0), seen.frame.stamp_ns))
+        if (s := float(seen.world_from_live.translation[2])) >= 120.0
+        else seen
+        for seen in driven
+    ]
+    mapped = map_simulated(path, seen_again, closes_loops=True)
+    assert bool(loop_edges(path, mapped)) is closes
 
 
 def test_places_that_cannot_be_read_close_no_loop(path: Path, monkeypatch) -> None:

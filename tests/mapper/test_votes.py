@@ -99,8 +99,9 @@ def test_a_robot_that_maps_removes_a_planted_edge_with_its_session(tmp_path: Pat
             for one in seen:
                 robot.step(one.logged)
     with open_map(path) as town:
+        # Some metres on: the third robot's first matches do not vote yet.
         a, b = (
-            next(node.id for node in town.graph.nodes if town.sessions[node.session].robot == name)
+            [node.id for node in town.graph.nodes if town.sessions[node.session].robot == name][8]
             for name in ("r0", "r1")
         )
         false = Edge(a, b, EdgeKind.MATCH, at(0.0, 6.0), SURE)
@@ -114,7 +115,8 @@ def test_a_robot_that_maps_removes_a_planted_edge_with_its_session(tmp_path: Pat
         open_map(path) as town,
         town.robot(camera, name="r2", maps=True, lanes=8, relocaliser=None) as robot,
     ):
-        robot.place_at(Position.at(a))
+        first = next(iter(town.graph.nodes)).id
+        robot.place_at(Position.at(first))
         found = [robot.step(one.logged) for one in drives[2]]
     assert sum(one.localised for one in found) > 30
     with open_map(path) as town:

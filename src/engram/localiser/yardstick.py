@@ -66,9 +66,17 @@ class LookalikeConfig:
         Meta(
             ge=0,
             description="log-odds that a run is not of look-alikes, from which a doubted one is "
-            "accepted again, and edges are created",
+            "accepted again",
         ),
     ] = 0.08
+    edges: Annotated[
+        float,
+        Meta(
+            ge=0,
+            description="log-odds that a run is not of look-alikes, from which its matches "
+            "create edges",
+        ),
+    ] = 4.0
     most: Annotated[
         float,
         Meta(
@@ -279,7 +287,8 @@ class Run:
 
     Attributes:
         believed: whether its matches are accepted.
-        proved: whether they showed, on the whole, what matches usually have.
+        proved: whether they showed enough of what matches usually have for edges: a wrong one
+            folds the map permanently, a late one costs nothing.
     """
 
     def __init__(self, config: LookalikeConfig) -> None:
@@ -312,12 +321,12 @@ class Run:
         total = self._alike + min(step_m / config.apart_m, 1.0) * alike
         self._alike = min(max(total, -config.most), config.most)
         self._at_m = driven_m
-        usual = self._alike <= -config.proof
         if self.believed:
             self.believed = self._alike <= (config.doubt_first if first else config.doubt)
         else:
-            self.believed = usual
-        self.proved = self.believed and (usual or (self.proved and not first))
+            self.believed = self._alike <= -config.proof
+        shown = self._alike <= -config.edges or (self.proved and not first)
+        self.proved = self.believed and shown
 
 
 def is_measured(kind: DescriptorKind) -> bool:

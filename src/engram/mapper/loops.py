@@ -11,6 +11,7 @@ the same parked cars. A match waits until another one, farther along, agrees wit
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -31,7 +32,7 @@ from engram.localiser.acceptance import AcceptanceConfig, Prediction, agrees
 from engram.localiser.attempts import Attempter, Candidate
 from engram.localiser.localisation import Position
 from engram.localiser.relocalisation import best_places, spread
-from engram.localiser.yardstick import Likeness, Yardstick, is_measured
+from engram.localiser.yardstick import ALIKE, Likeness, Yardstick, is_measured
 from engram.places.words import PlaceBook
 
 # Most likely places, from which those to attempt are chosen apart from each other.
@@ -59,6 +60,9 @@ class LoopConfig:
             other, metres.
         proof: mean log-odds that two matches are no look-alikes, from which they confirm each
             other. Source: `lab/reports/lookalikes.md`.
+        own_share: share of the usual inliers that two matches with nodes of the same drive must
+            have in the geometric mean: within minutes neither light nor season excuses fewer.
+            Source: as `proof`.
     """
 
     attempts: int = 8
@@ -69,7 +73,8 @@ class LoopConfig:
     confirm_after_most_m: float = 20.0
     confirm_within_m: float = 22.0
     certain_m: float = 1.0
-    proof: float = 0.5
+    proof: float = 2.0
+    own_share: float = 0.6
 
     def __post_init__(self) -> None:
         for name in ("attempts", "answer_after_frames"):
@@ -81,6 +86,8 @@ class LoopConfig:
         ):  # fmt: skip
             if not 0 <= getattr(self, name) < np.inf:
                 raise ConfigError(f"loops: {name} is {getattr(self, name)}, must be >= 0")
+        if not 0 < self.own_share < np.inf:
+            raise ConfigError(f"loops: own_share is {self.own_share}, must be > 0")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,13 +196,18 @@ class LoopSearch:
 
     def _weighed(self, found: _Match) -> _Match:
         """The match with the log-odds that it is a look-alike."""
-        index = self._graph.index(found.edge.a)
+        graph, edge = self._graph, found.edge
+        index = graph.index(edge.a)
         usual = None if self._yardstick is None else self._yardstick.usual(index)
         known = self._attempter.frame(found.edge.a)
         if usual is None or known is None or not is_measured(known.descriptor):
             return found
         likeness = Likeness.of(found.match, known, found.frame, usual)
-        return replace(found, alike=likeness.alike() + self.config.proof)
+        alike = likeness.alike() + self.config.proof
+        if graph.node(index).session == graph.node(graph.index(edge.b)).session:
+            missing = math.log(self.config.own_share) - likeness.share
+            alike = max(alike, -ALIKE.share * missing)
+        return replace(found, alike=alike)
 
     def _confirmed(self, match: _Match) -> list[_Match]:
         """The match and the waiting ones that agree with it; none if it must wait itself."""
