@@ -133,6 +133,17 @@ class WriterLock:
             self._file = -1
 
 
+@contextmanager
+def taking_turns(path: Path) -> Iterator[None]:
+    """Waits until no other thread or process is in such a block of this lock file; it stays."""
+    file = os.open(path, os.O_RDWR | os.O_CREAT | _OPEN_LOCK, 0o600)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(file)
+
+
 def current_holder(path: Path) -> Holder | None:
     """The process that writes to a file now; None if there is none. Takes no lock."""
     try:

@@ -27,7 +27,7 @@ from sqlalchemy import Table
 from engram.errors import InputError, MapCorruptError, MapError, extra
 from engram.maps.exchange import EXCHANGED, MapRows, Values, map_of_rows
 from engram.maps.map import Map
-from engram.maps.schema import frames, vocabularies
+from engram.maps.schema import VERSIONED, frames, revisions, vocabularies
 
 # SHA-256 of a part's bytes.
 PartHash = NewType("PartHash", bytes)
@@ -45,6 +45,7 @@ TABLES: dict[str, Table] = {table.name: table for table in EXCHANGED}
 
 _Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 _encode = msgspec.msgpack.Encoder().encode
+_HEAD_BYTES = 5  # of a page, before its rows
 
 
 def part_hash(body: bytes) -> PartHash:
@@ -79,7 +80,7 @@ def encode_pages(rows: Iterable[Sequence[Any]]) -> Iterator[bytes]:
 
 def _joined(rows: list[bytes]) -> bytes:
     """A MessagePack array of encoded rows."""
-    head = bytes([0xDD]) + len(rows).to_bytes(4, "big")
+    head = bytes([0xDD]) + len(rows).to_bytes(_HEAD_BYTES - 1, "big")
     return head + b"".join(rows)
 
 
@@ -315,7 +316,8 @@ def join(manifest: Manifest, source: Source, path: Path, *, thin: bool = False) 
     with map_of_rows(path) as put:
         for name, table in TABLES.items():
             for page in manifest.pages.get(name, ()):
-                put(table, _whole_rows(table, _needed(source, page), source, thin))
+                slim = decode_page(table, _needed(source, page))
+                put(table, whole_rows(table, slim, source, thin=thin))
     try:
         with Map.open(path, at=None) as store:
             found = store.verified_hash()
@@ -335,17 +337,42 @@ def blobs_named(manifest: Manifest, source: Source) -> Iterator[tuple[str, int, 
         MissingPartError: a page is missing.
         MapCorruptError: a page does not hold rows of its table.
     """
-    for table, columns in BLOBS.items():
-        places = [table.columns.keys().index(name) for name in columns]
+    for table in BLOBS:
         for page in manifest.pages.get(table.name, ()):
             for row in decode_page(table, _needed(source, page)):
-                yield table.name, row[0], [row[at] for at in places if row[at] is not None]
+                yield table.name, row[0], blobs_of(table, row)
 
 
-def _whole_rows(table: Table, page: bytes, source: Source, thin: bool) -> Iterator[Sequence[Any]]:
-    """The rows of a page with their blobs."""
-    places = [table.columns.keys().index(name) for name in BLOBS.get(table, ())]
-    for slim in decode_page(table, page):
+def blobs_of(table: Table, row: Values) -> list[PartHash]:
+    """Hashes of the blobs of a row as it is in pages."""
+    return [row[at] for at in _blob_places(table) if row[at] is not None]
+
+
+def _blob_places(table: Table) -> list[int]:
+    return [table.columns.keys().index(name) for name in BLOBS.get(table, ())]
+
+
+def slim_row(table: Table, row: Values) -> Values:
+    """A row as it is in pages: the hashes of its blobs in their places."""
+    if table not in BLOBS:
+        return row
+    slim = list(row)
+    for at in _blob_places(table):
+        if slim[at] is not None:
+            slim[at] = part_hash(slim[at])
+    return slim
+
+
+def whole_rows(
+    table: Table, rows: Iterable[Values], source: Source, *, thin: bool = False
+) -> Iterator[Values]:
+    """Undoes `slim_row`; without frames that are missing if `thin`.
+
+    Raises:
+        MissingPartError: another blob is missing.
+    """
+    places = _blob_places(table)
+    for slim in rows:
         row = list(slim)
         try:
             for at in places:
@@ -395,13 +422,50 @@ class Split:
                     yield rows.one(table, key)[at]
 
 
-def split(location: Path, at: int | None = None, known: Collection[PartHash] = ()) -> Split:
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """The pages of a table that stay whatever is added, and the key from which on rows follow."""
+
+    pages: tuple[PartHash, ...] = ()
+    since: int | None = None
+
+
+# Rows of the others come, change and go without a revision.
+ONLY_ADDED = (revisions, *VERSIONED)
+
+
+def full_pages(manifest: Manifest, source: Source) -> dict[str, Kept]:
+    """The pages of a map, by table, that a later revision of it has as well.
+
+    Raises:
+        MissingPartError: the last page of a table is missing.
+    """
+    found = {}
+    for table in ONLY_ADDED:
+        pages = manifest.pages.get(table.name, ())
+        if not pages:
+            continue
+        body = _needed(source, pages[-1])
+        rows = decode_page(table, body)
+        is_full = len(body) - _HEAD_BYTES >= PAGE_BYTES
+        key = rows[-1][0] + 1 if is_full else rows[0][0]
+        found[table.name] = Kept(pages if is_full else pages[:-1], key)
+    return found
+
+
+def split(
+    location: Path,
+    at: int | None = None,
+    known: Collection[PartHash] = (),
+    kept: Mapping[str, Kept] | None = None,
+) -> Split:
     """Takes a map apart.
 
     Args:
         location: the map file; another process may write to it.
         at: the last revision to hand over; None for the newest.
         known: parts that the other side has, which are left out of `pages` and `blobs`.
+        kept: pages that the map is known to have, by table: their rows are not read.
 
     Raises:
         MapError: the map cannot be read or is damaged.
@@ -410,8 +474,9 @@ def split(location: Path, at: int | None = None, known: Collection[PartHash] = (
     pages: dict[str, tuple[PartHash, ...]] = {}
     with closing(MapRows(location, at)) as rows:
         for table in EXCHANGED:
-            hashes = []
-            for page in encode_pages(_slim(found, table, row, known) for row in rows.of(table)):
+            before = (kept or {}).get(table.name, Kept())
+            hashes, own = list(before.pages), rows.of(table, before.since)
+            for page in encode_pages(_slim(found, table, row, known) for row in own):
                 name = part_hash(page)
                 hashes.append(name)
                 if name not in known:
@@ -424,18 +489,12 @@ def split(location: Path, at: int | None = None, known: Collection[PartHash] = (
     return found
 
 
-def _slim(found: Split, table: Table, row: Values, known: Collection[PartHash]) -> Sequence[Any]:
-    """The row with the hashes of its blobs in their places."""
-    if table not in BLOBS:
-        return row
-    slim = list(row)
-    for name in BLOBS[table]:
-        at = table.columns.keys().index(name)
-        if slim[at] is not None:
-            body = slim[at]
-            slim[at] = part_hash(body)
-            if slim[at] not in known:
-                found.blobs[slim[at]] = (table, row[0], at)
+def _slim(found: Split, table: Table, row: Values, known: Collection[PartHash]) -> Values:
+    """The row as it is in pages; notes its blobs."""
+    slim = slim_row(table, row)
+    for at in _blob_places(table):
+        if slim[at] is not None and slim[at] not in known:
+            found.blobs[slim[at]] = (table, row[0], at)
     return slim
 
 
