@@ -79,10 +79,10 @@ class Site:
     def token(self, role: Role | str, name: str = NAME) -> dict[str, str]:
         return {"Authorization": f"Bearer {add_person(self.centre, role, name, Role(role))}"}
 
-    def robot(self, name: str, follows: str = "head") -> Agent:
-        """A robot that has enrolled."""
+    def robot(self, name: str, follows: str = "head", on: str = NAME) -> Agent:
+        """A robot that has enrolled on a map."""
         if name not in self.agents:
-            code = new_code(self.centre, NAME, follows, "tests")
+            code = new_code(self.centre, on, follows, "tests")
             enrol(self.folder / name, "http://centre", code, name, self.http)
             self.agents[name] = self._agent(name)
         return self.agents[name]
@@ -155,6 +155,27 @@ def opened_site(request, folder: Path) -> Iterator[Site]:
     found.close()
     if request.param == "services":
         drop_database(options["database"])
+
+
+@pytest.fixture(params=KINDS)
+def apart(request, tmp_path):
+    """A site, and the centre of a second worker, whose folders share nothing.
+
+    Embedded they share an SQLite file and a folder of objects.
+    """
+    shared = tmp_path / "shared"
+    (shared / "objects").mkdir(parents=True)
+    database, objects = f"sqlite:///{shared / 'centre.sqlite'}", f"file://{shared / 'objects'}"
+    if request.param == "services":
+        objects = f"{request.getfixturevalue('s3')}/{uuid.uuid4().hex}"
+        database = new_database()
+    found = Site(tmp_path / "first", database=database, objects=objects)
+    found.centre.keep_copies(NAME, "tests")
+    with Centre(tmp_path / "second", database, objects, clock=found.clock) as other:
+        yield found, other
+    found.close()
+    if request.param == "services":
+        drop_database(database)
 
 
 def new_database() -> str:

@@ -10,7 +10,7 @@ from sqlalchemy import update
 from engram.cli.settings import AllSettings
 from engram.errors import FormatVersionError
 from engram.fleet.centre.service import Centre, MapPolicy
-from engram.fleet.centre.tables import centre
+from engram.fleet.centre.tables import Published, centre, published
 from engram.fleet.merge.merge_settings import MergeOptions
 
 from .conftest import drive
@@ -25,12 +25,22 @@ def test_a_policy_is_read_as_it_was_set(tmp_path):
         assert centre.policy("fleet") == policy
 
 
-@pytest.mark.parametrize("version", [1, 2, 4])
+@pytest.mark.parametrize("version", [1, 2, 5])
 def test_tables_of_another_version_are_refused_with_what_to_do(tmp_path, version):
     with Centre(tmp_path) as opened, opened.database.writing() as connection:
         connection.execute(update(centre).values(version=version))
     with pytest.raises(FormatVersionError, match=rf"of version {version}, .* enrol the robots"):
         Centre(tmp_path)
+
+
+def test_tables_from_before_copies_get_the_table_that_they_lack(tmp_path):
+    with Centre(tmp_path) as opened, opened.database.writing() as connection:
+        published.drop(connection)
+        connection.execute(update(centre).values(version=3))
+    with Centre(tmp_path) as opened:
+        assert opened.database.rows(Published) == []
+        opened.add_map("fleet", "tests")
+    Centre(tmp_path).close()
 
 
 def test_maps_that_were_copied_into_a_new_centre_are_served_there(tmp_path):

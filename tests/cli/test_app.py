@@ -59,6 +59,18 @@ def test_what_a_map_of_a_centre_is_not_told_stays(engram, tmp_path) -> None:
     assert cleared.out == "fleet: gate none, moves none, quiet none\n"
 
 
+def test_copies_of_a_map_take_stores_that_all_workers_reach(engram, tmp_path, monkeypatch) -> None:
+    town = tmp_path / "town"
+    (tmp_path / "parts").mkdir()
+    refused = engram("centre", "map", town, "fleet", "--copies")
+    assert refused.status == 2
+    assert "set ENGRAM_DATABASE and ENGRAM_OBJECTS" in refused.err
+    monkeypatch.setenv("ENGRAM_DATABASE", f"sqlite:///{tmp_path / 'tables.sqlite'}")
+    monkeypatch.setenv("ENGRAM_OBJECTS", f"file://{tmp_path / 'parts'}")
+    assert engram("centre", "map", town, "fleet", "--copies").status == 0
+    assert engram("centre", "jobs", tmp_path / "copy").status == 0
+
+
 def test_a_map_of_a_centre_takes_no_settings_with_which_every_merge_fails(engram, tmp_path) -> None:
     for given in (["--moves", "head"], ["--moves", "My ref"], ["--gate", tmp_path / "no.framelog"]):
         ran = engram("centre", "map", tmp_path / "town", "fleet", *given)

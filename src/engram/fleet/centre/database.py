@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from sqlalchemy import (
@@ -29,13 +30,21 @@ from sqlalchemy import (
     make_url,
     select,
     text,
+    update,
 )
 from sqlalchemy.dialects.postgresql import insert as insert_postgresql
 from sqlalchemy.dialects.sqlite import insert as insert_sqlite
 from sqlalchemy.exc import ArgumentError, DataError, DBAPIError
 
 from engram import __version__
-from engram.errors import FormatVersionError, InputError, StorageFullError, extra
+from engram.errors import (
+    FormatVersionError,
+    InputError,
+    MapLockedError,
+    StorageFullError,
+    extra,
+)
+from engram.files import WriterLock
 from engram.fleet.centre.problems import StoreError
 from engram.fleet.centre.tables import (
     TABLES,
@@ -46,6 +55,7 @@ from engram.fleet.centre.tables import (
     audit,
     centre,
     metadata,
+    published,
     subjects,
     values_of,
 )
@@ -55,6 +65,10 @@ _BUSY_S = 30.0
 # One writer at a time on PostgreSQL too: numbers of the audit and of completion have no gaps.
 _WRITERS = 0x456E6772
 _DISK_FULL = "53100"  # of PostgreSQL
+# Of tables that lack only the one of published maps.
+_WITHOUT_COPIES = 3
+# A machine that is gone without a word is noticed within a minute, and its lanes are free.
+_KEPT_ALIVE = {"idle": 30, "interval": 10, "count": 3}
 
 
 class ServiceDatabase:
@@ -146,6 +160,18 @@ class ServiceDatabase:
         """The first row of a table to which the conditions apply; None if there is none."""
         return next(iter(self.rows(kind, *where, limit=1)), None)
 
+    def lane(self, name: str) -> WriterLock | AdvisoryLock:
+        """Takes a lock that all who use this database share, until `release` or death.
+
+        Raises:
+            MapLockedError: another worker has it.
+            StoreError: the database cannot be reached.
+        """
+        if self._sqlite:
+            path = Path(self._engine.url.database or "")
+            return WriterLock(path.with_name(f"{path.name}.{name}.lane"))
+        return AdvisoryLock(self._engine, name)
+
     def close(self) -> None:
         """Closes all connections."""
         self._engine.dispose()
@@ -158,7 +184,10 @@ class ServiceDatabase:
             connection.execute(insert(centre).values(**values_of(Schema(1, VERSION))))
             return
         version = connection.execute(select(centre.c.version)).scalar_one()
-        if version != VERSION:
+        if version == _WITHOUT_COPIES:
+            published.create(connection, checkfirst=True)
+            connection.execute(update(centre).values(version=VERSION))
+        elif version != VERSION:
             raise FormatVersionError(
                 f"the centre's tables are of version {version}, Engram {__version__} uses "
                 f"{VERSION}: open it with the Engram that wrote it, or copy its maps/*.engram into "
@@ -190,6 +219,43 @@ def rows_of(
 def first_row(connection: Connection, kind: type[Row], *where: ColumnElement[bool]) -> Row | None:
     """The first row of a table to which the conditions apply; None if there is none."""
     return next(iter(rows_of(connection, kind, *where, limit=1)), None)
+
+
+class AdvisoryLock:
+    """A lock in PostgreSQL, held by a connection of its own.
+
+    Raises:
+        MapLockedError: another connection holds it.
+        StoreError: the database cannot be reached.
+    """
+
+    def __init__(self, engine: Engine, name: str) -> None:
+        key = int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big", signed=True)
+        with _errors():
+            self._connection = engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+        try:
+            with _errors():
+                self._connection.detach()  # closed, not kept for others: it never keeps the lock
+                for what, value in _KEPT_ALIVE.items():
+                    self._connection.execute(text(f"SET tcp_keepalives_{what} = {value}"))
+                take = text(f"SELECT pg_try_advisory_lock({key})")
+                if not self._connection.execute(take).scalar():
+                    raise MapLockedError(f"another worker has {name}; wait until it is done")
+        except BaseException:
+            self._connection.close()
+            raise
+
+    def release(self) -> None:
+        """Lets others take it.
+
+        Raises:
+            StoreError: the database is away; the lock goes with the connection.
+        """
+        try:
+            with _errors():  # at once: the server notices a closed connection a little later
+                self._connection.execute(text("SELECT pg_advisory_unlock_all()"))
+        finally:
+            self._connection.close()
 
 
 class _SharedSync:

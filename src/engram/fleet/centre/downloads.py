@@ -16,7 +16,6 @@ from engram.errors import ConfigError, EngramError, StorageFullError
 from engram.fleet.centre import jobs
 from engram.fleet.centre.database import note
 from engram.fleet.centre.fleet import revision_of, version_of
-from engram.fleet.centre.objects import PACK_BYTES
 from engram.fleet.centre.problems import ConflictError, StoreError
 from engram.fleet.centre.service import DAY_NS, Centre, manifest_key
 from engram.fleet.centre.tables import (
@@ -31,7 +30,6 @@ from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.transfers import (
     Manifest,
     PartHash,
-    Split,
     blobs_named,
     decode_manifest,
     encode_manifest,
@@ -153,7 +151,7 @@ def _made(centre: Centre, row: Artifact) -> tuple[str, dict[str, Any]]:
         options = options_of(row.options)
         report = download(centre.map_path(row.map), path, options, at=row.revision)
         taken = split(path)
-        _store_parts(centre, row.map, taken)
+        centre.packs(row.map).add_split(taken, centre.now_ns)
         manifest = encode_manifest(taken.manifest)
         centre.objects.put(manifest_key(row.map, taken.manifest.id), manifest)
         centre.objects.put_file(file_key(row), path)
@@ -161,14 +159,3 @@ def _made(centre: Centre, row: Artifact) -> tuple[str, dict[str, Any]]:
         path.unlink(missing_ok=True)
     shown = {key: value for key, value in report.to_dict().items() if key != "out"}
     return taken.manifest.id, shown
-
-
-def _store_parts(centre: Centre, name: str, taken: Split) -> None:
-    packs, batch, size = centre.packs(name), list[bytes](), 0
-    for body in taken.parts(packs.missing([*taken.pages, *taken.blobs])):
-        batch.append(body)
-        size += len(body)
-        if size >= PACK_BYTES:
-            packs.add(batch, centre.now_ns())
-            batch, size = [], 0
-    packs.add(batch, centre.now_ns())

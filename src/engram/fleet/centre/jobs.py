@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Connection, update
 
 from engram.errors import InputError
+from engram.fleet.centre.copies import Publication
 from engram.fleet.centre.database import first_row, note, notify
 from engram.fleet.centre.problems import UnknownError
 from engram.fleet.centre.service import Centre
@@ -96,6 +97,7 @@ def set_state(
     state: JobState,
     by: str = WORKER,
     action: str | None = None,
+    made: Publication | None = None,
     **change: Any,
 ) -> Job:
     """Ends a job or opens it again, unless its state has changed since it was read.
@@ -108,10 +110,14 @@ def set_state(
         state: its new state.
         by: who changes it.
         action: name of the event; None for that of the state.
+        made: what is published with it.
         **change: further columns.
 
     Returns:
         The job as it is now.
+
+    Raises:
+        StoreError: it cannot be published; nothing has changed.
     """
     kind = type(row)
     table, now = TABLES[kind], centre.now_ns()
@@ -120,6 +126,7 @@ def set_state(
     values = {name: value for name, value in values.items() if name in table.c}
     with centre.database.writing() as connection:
         if connection.execute(of_row.values(**values)).rowcount:
+            centre.copies.publish(connection, made)
             result = {
                 name: change[name] for name in ("revision", "error") if change.get(name) is not None
             }

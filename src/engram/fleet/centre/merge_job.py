@@ -39,6 +39,7 @@ from engram.errors import (
     WorkerError,
 )
 from engram.fleet.centre import handins, jobs
+from engram.fleet.centre.copies import Publication
 from engram.fleet.centre.fleet import move_ref
 from engram.fleet.centre.problems import MissingPartsError, StoreError
 from engram.fleet.centre.service import Centre, CentreSettings
@@ -226,6 +227,7 @@ def merge_hand_in(centre: Centre, row: HandIn) -> None:
                 settings=Settings(),
                 require_better=[] if row.ungated else [Path(drive) for drive in policy.gate],
             )
+            made = None if report.interrupted else centre.prepared(row.map)
     except MissingPartsError:  # the map changed since they were requested, by a revert
         jobs.set_state(centre, row, JobState.OPEN, tries=0)
     except RefusedError as error:
@@ -246,7 +248,7 @@ def merge_hand_in(centre: Centre, row: HandIn) -> None:
         _log.exception("%s: hand-in %s", row.map, row.id[:8])
         _end(centre, row, f"an unexpected fault, {centre.fault_of(error)}")
     else:
-        _settle(centre, row, report)
+        _settle(centre, row, report, made)
         took_s = time.monotonic() - begun_s
         _log.info("%s: hand-in %s took %.1f s of work", row.map, row.id[:8], took_s)
 
@@ -255,7 +257,7 @@ def _end(centre: Centre, row: HandIn, why: str, state: JobState = JobState.FAILE
     jobs.set_state(centre, row, state, error=why)
 
 
-def _settle(centre: Centre, row: HandIn, report: MergeReport) -> None:
+def _settle(centre: Centre, row: HandIn, report: MergeReport, made: Publication | None) -> None:
     if report.interrupted:
         _end(centre, row, "cancelled", JobState.CANCELLED)
         return
@@ -263,7 +265,7 @@ def _settle(centre: Centre, row: HandIn, report: MergeReport) -> None:
     revision = report.revision
     if revision is None:  # nothing new; or a worker died between the merge and this row
         revision = _revision_of(centre.map_path(row.map), row.content_hash)
-    jobs.set_state(centre, row, JobState.MERGED, revision=revision, report=shown)
+    jobs.set_state(centre, row, JobState.MERGED, made=made, revision=revision, report=shown)
     policy = centre.policy(row.map)
     if policy.moves is not None and revision and not row.ungated:
         move_ref(centre, row.map, policy.moves, revision, "gate")

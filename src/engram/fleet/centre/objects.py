@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections import OrderedDict
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
@@ -17,7 +17,7 @@ from engram.errors import MapError, extra, storage_full
 from engram.fleet.centre.database import ServiceDatabase, rows_of
 from engram.fleet.centre.problems import StoreError
 from engram.fleet.centre.tables import GivenPart, Pack, PackedPart, given, packs, parts
-from engram.fleet.transfers import PartHash, part_hash
+from engram.fleet.transfers import PartHash, Split, part_hash
 from engram.monitor import write_whole
 
 
@@ -227,6 +227,17 @@ class Packs:
                     continue  # the rest was swept after it was looked for
                 return self._note_given(connection, bodies, robot)
 
+    def add_split(self, taken: Split, clock: Callable[[], int]) -> None:
+        """Stores the parts of a map that are missing, a pack at a time."""
+        batch, size = list[bytes](), 0
+        for body in taken.parts(self.missing([*taken.pages, *taken.blobs])):
+            batch.append(body)
+            size += len(body)
+            if size >= PACK_BYTES:
+                self.add(batch, clock())
+                batch, size = [], 0
+        self.add(batch, clock())
+
     def _note_given(
         self, connection: Connection, bodies: dict[PartHash, bytes], robot: str | None
     ) -> int:
@@ -240,7 +251,11 @@ class Packs:
     def missing(self, wanted: Collection[PartHash]) -> list[PartHash]:
         """Those parts that are not stored."""
         with self._database.reading() as connection:
-            stored = self._places(connection, wanted)
+            return self.missing_in(connection, wanted)
+
+    def missing_in(self, connection: Connection, wanted: Collection[PartHash]) -> list[PartHash]:
+        """Those parts that are not stored, as a transaction sees it."""
+        stored = self._places(connection, wanted)
         return [part for part in wanted if part not in stored]
 
     def read(self, wanted: Iterable[PartHash]) -> Iterator[tuple[PartHash, bytes]]:

@@ -136,20 +136,22 @@ def revert(
 
     Sent again after its answer was lost, it fails with 412 instead of reverting twice.
     """
-    expected, path = _version(if_match), centre.map_path(name)
+    expected = _version(if_match)
     if not body.dry_run and expected is None:
         raise ChangedError("If-Match is missing: send the ETag of the ref head")
-    with Map.open(path) as store, store.writing():
+    with centre.changing(name) as store:
         if expected is not None and store.revision != expected:
             raise ChangedError(f"head is revision {store.revision}, not {expected}: read it again")
         done = store.revert(
             body.revision, author=who.name, message=body.message, dry_run=body.dry_run
         )
-    number = None if done.revision is None else done.revision.number
-    if number is not None:
-        with centre.database.writing() as connection:
-            detail = {"reverted": body.revision, "revision": number}
-            note(connection, centre.now_ns(), who.id, "revert", name, **detail)
+        number = None if done.revision is None else done.revision.number
+        if number is not None:
+            made = centre.prepared(name)
+            with centre.database.writing() as connection:
+                detail = {"reverted": body.revision, "revision": number}
+                note(connection, centre.now_ns(), who.id, "revert", name, **detail)
+                centre.copies.publish(connection, made)
     old, new = done.difference.old, done.difference.new
     return models.Reverted(
         revision=number,

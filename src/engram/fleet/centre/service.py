@@ -7,7 +7,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,10 +18,20 @@ from sqlalchemy import URL, Connection, Select, func, select, update
 from engram.config import check_bounds, from_dict, to_dict
 from engram.errors import InputError, MapLockedError
 from engram.files import WriterLock
-from engram.fleet.centre.database import AuditCheck, ServiceDatabase, note
+from engram.fleet.centre.copies import Copies, Publication, published_key
+from engram.fleet.centre.database import AdvisoryLock, AuditCheck, ServiceDatabase, note
 from engram.fleet.centre.objects import BucketObjects, FolderObjects, Objects, Packs
 from engram.fleet.centre.problems import UnknownError
-from engram.fleet.centre.tables import JobState, MapListed, artifacts, handins, maps, refs
+from engram.fleet.centre.tables import (
+    JobState,
+    MapListed,
+    Published,
+    artifacts,
+    handins,
+    maps,
+    published,
+    refs,
+)
 from engram.fleet.merge.merge_settings import MergeOptions
 from engram.maps.map import Map
 from engram.maps.records import Revision
@@ -31,6 +41,7 @@ from engram.maps.records import Revision
 class _Held:
     store: Map
     inode: int
+    published: Published | None
     users: int = 0
     retired: bool = False
 
@@ -46,14 +57,18 @@ class OpenMaps:
         self._lock = threading.Lock()
 
     @contextmanager
-    def reading(self, path: Path) -> Iterator[Map]:
+    def reading(self, path: Path, published: Published | None = None) -> Iterator[Map]:
         """The map as of its newest revision, which stays as it is within the block.
+
+        Args:
+            path: its file.
+            published: what of it is published, if it is a copy: no later revision counts.
 
         Raises:
             MapError: it cannot be read.
         """
         with self._lock:
-            held = self._newest(path)
+            held = self._newest(path, published)
             held.users += 1
         try:
             yield held.store
@@ -70,16 +85,21 @@ class OpenMaps:
                 _close_unused(held)
             self._held.clear()
 
-    def _newest(self, path: Path) -> _Held:
+    def _newest(self, path: Path, published: Published | None) -> _Held:
         held, inode = self._held.get(path), _inode(path)
         if held is not None:
-            if held.inode == inode and held.store.resolve(None) == held.store.revision:
+            if (held.inode, held.published) == (inode, published) and _is_newest(held):
                 return held
             del self._held[path]
             held.retired = True
             _close_unused(held)
-        held = self._held[path] = _Held(Map.open(path), inode)
+        at = None if published is None else published.revision
+        held = self._held[path] = _Held(Map.open(path, at=at), inode, published)
         return held
+
+
+def _is_newest(held: _Held) -> bool:
+    return held.published is not None or held.store.resolve(None) == held.store.revision
 
 
 def log_of(store: Map) -> tuple[Revision, ...]:
@@ -151,11 +171,12 @@ def manifest_key(name: str, manifest: str) -> str:
     return f"manifests/{name}/{manifest}"
 
 
-def needed_manifests(connection: Connection, name: str, limit_ns: int) -> list[str]:
-    """Manifests of one map whose parts must stay.
+def needed_manifests(connection: Connection, name: str, limit_ns: int) -> dict[str, str]:
+    """Manifests of one map whose parts must stay: where each is kept among the objects, by its id.
 
     Those of hand-ins that are under way, refused, or ended since a time, and of what these
-    continue; of each robot's newest merged one, which its next one continues; and of downloads.
+    continue; of each robot's newest merged one, which its next one continues; of downloads; and of
+    what is published.
     """
     of_map = handins.c.map == name
     newest = newest_merged(name)
@@ -169,7 +190,9 @@ def needed_manifests(connection: Connection, name: str, limit_ns: int) -> list[s
         select(artifacts.c.manifest).where(ready),
     ):
         found += connection.execute(query).scalars()
-    return list(dict.fromkeys(found))
+    keys = {manifest: manifest_key(name, manifest) for manifest in found}
+    query = select(published.c.manifest).where(published.c.map == name)
+    return keys | {one: published_key(name, one) for one in connection.execute(query).scalars()}
 
 
 def newest_merged(name: str) -> Select[Any]:
@@ -192,12 +215,15 @@ class MapPolicy:
         gate: held-out drives that must not localise worse after a merge; paths of the centre.
         moves: ref that follows every merge that passed the gate; None for none.
         quiet: hours of the day in which it dreams by itself, from and to, UTC; None for never.
+        copies: whether each worker keeps a copy in a folder of its own; see `engram.fleet.centre.
+            copies`.
     """
 
     merge: MergeOptions = field(default_factory=MergeOptions)
     gate: tuple[str, ...] = ()
     moves: str | None = None
     quiet: tuple[float, float] | None = None
+    copies: bool = False
 
     def is_quiet(self, now_ns: int) -> bool:
         """Whether a time is within its quiet hours; equal ends are the whole day."""
@@ -244,6 +270,7 @@ class Centre:
         self.objects: Objects = (
             FolderObjects(self.folder / "objects") if objects is None else BucketObjects(objects)
         )
+        self.copies = Copies(self)
         self.audit = AuditCheck()
         self._packs: dict[str, Packs] = {}
         self._open_maps = OpenMaps()
@@ -285,6 +312,10 @@ class Centre:
                 "most 40 characters"
             )
         path = self.folder / "maps" / f"{name}.engram"
+        if self._has_copies(name):
+            if not path.exists():
+                self.copies.bring(name)
+            return
         if not path.exists():
             if name in self.map_names():
                 raise InputError(
@@ -297,6 +328,8 @@ class Centre:
             if self.database.add(connection, row):
                 note(connection, self.now_ns(), by, "map", name)
             self._follow_file(connection, name, by)
+        if self.database.rows(Published, limit=1):  # as of the maps that there are
+            self.keep_copies(name, by)
 
     def _follow_file(self, connection: Connection, name: str, by: str) -> None:
         """Makes the tables of a map say what its file holds, if an older one was restored.
@@ -317,22 +350,103 @@ class Centre:
         if any(changed):
             note(connection, now, by, "older-file", name, revision=head, handins=changed[0])
 
+    def keep_copies(self, name: str, by: str) -> None:
+        """Lets workers keep copies of a map, and publishes what the file in this folder holds.
+
+        Again it publishes what was committed or erased by hand since, while no worker ran here.
+
+        Raises:
+            InputError: tables or parts are in this folder, or the file does not continue what is
+                published.
+            MapLockedError: a worker has the map.
+            StorageFullError, StoreError, MapError: it cannot be published now.
+        """
+        if None in self.addresses:
+            raise InputError(
+                "workers bring copies up to date from tables and parts that all of them reach: set "
+                "ENGRAM_DATABASE and ENGRAM_OBJECTS"
+            )
+        with self._alone_with(name):
+            row = self.map_row(name)
+            if _is_copied(row) and not self.copies.continues(name):
+                return
+            found = self.copies.prepare(name, whole=True)
+            policy = replace(from_dict(row.options, MapPolicy), copies=True)
+            with self.database.writing() as connection:
+                self.database.put(connection, replace(row, options=to_dict(policy)))
+                self.copies.publish(connection, found)
+                note(connection, self.now_ns(), by, "copies", name)
+
+    @contextmanager
+    def _alone_with(self, name: str) -> Iterator[None]:
+        """Has both lanes of a map: that of this folder, and that of the database."""
+        lanes: list[WriterLock | AdvisoryLock]
+        lanes = [WriterLock(self.folder / "maps" / f"{name}.lane")]
+        try:
+            lanes.append(self.database.lane(name))
+            yield
+        finally:
+            for lane in lanes:
+                lane.release()
+
+    def _has_copies(self, name: str) -> bool:
+        row = self.database.row(MapListed, maps.c.name == name)
+        return row is not None and _is_copied(row)
+
     def map_names(self) -> list[str]:
         """All maps."""
         return [row.name for row in self.database.rows(MapListed, order=maps.c.name)]
 
     @contextmanager
     def lane(self, name: str) -> Iterator[bool]:
-        """Whether this worker has a map, or its downloads, to itself; its death frees them."""
+        """Whether this worker has a map, or its downloads, to itself; its death frees them.
+
+        The copy of a map is then what is published, and no other worker can publish.
+
+        Raises:
+            StorageFullError, StoreError, MapError: the copy cannot be brought up to date now.
+        """
+        of_map, _, of_downloads = name.partition(".")
+        has_copies = self._has_copies(of_map)
         try:
-            lock = WriterLock(self.folder / "maps" / f"{name}.lane")
+            if has_copies:
+                lock = self.database.lane(name)
+            else:
+                lock = WriterLock(self.folder / "maps" / f"{name}.lane")
         except MapLockedError:
             yield False
             return
         try:
+            if has_copies and not of_downloads:
+                self.copies.renew(of_map)
             yield True
         finally:
             lock.release()
+
+    @contextmanager
+    def changing(self, name: str) -> Iterator[Map]:
+        """A map, locked to be changed by a person; see `published`.
+
+        Raises:
+            UnknownError: there is none.
+            MapLockedError: a worker has it.
+        """
+        path = self.map_path(name)
+        with self.lane(name) if self._has_copies(name) else nullcontext(True) as is_ours:
+            if not is_ours:
+                raise MapLockedError(f"a worker merges into {name}; wait until it is done")
+            with Map.open(path) as store, store.writing():
+                yield store
+
+    def prepared(self, name: str) -> Publication | None:
+        """What was committed to a copy of a map, to be published with `Copies.publish`.
+
+        None if that is nothing, or workers share the file: then it counts already.
+
+        Raises:
+            StorageFullError, StoreError, MapError: it cannot be stored now.
+        """
+        return self.copies.prepare(name) if self._has_copies(name) else None
 
     def map_row(self, name: str) -> MapListed:
         """The row of a map.
@@ -346,12 +460,13 @@ class Centre:
         return row
 
     def map_path(self, name: str) -> Path:
-        """The file of a map.
+        """The file of a map, which holds what is published if it is a copy.
 
         Raises:
             UnknownError: there is none.
+            StoreError, MapError: a copy cannot be brought up to date now.
         """
-        self.map_row(name)
+        self._brought(name)
         return self.folder / "maps" / f"{name}.engram"
 
     def reading(self, name: str) -> AbstractContextManager[Map]:
@@ -359,8 +474,14 @@ class Centre:
 
         Raises:
             UnknownError: there is none.
+            StoreError, MapError: a copy cannot be brought up to date now.
         """
-        return self._open_maps.reading(self.map_path(name))
+        published = self._brought(name)
+        return self._open_maps.reading(self.folder / "maps" / f"{name}.engram", published)
+
+    def _brought(self, name: str) -> Published | None:
+        """What is published of a map, once the copy here has it; None if there are no copies."""
+        return self.copies.bring(name) if _is_copied(self.map_row(name)) else None
 
     def policy(self, name: str) -> MapPolicy:
         """How a map takes hand-ins."""
@@ -386,6 +507,10 @@ class Centre:
         with self.database.writing() as connection:
             self.database.put(connection, row)
             note(connection, self.now_ns(), by, "durable", name, revision=revision)
+
+
+def _is_copied(row: MapListed) -> bool:
+    return bool(row.options.get("copies"))
 
 
 def kept_since_ns(centre: Centre) -> int:

@@ -24,7 +24,6 @@ from engram.fleet.centre.objects import FolderObjects, sync_folder
 from engram.fleet.centre.service import Centre
 from engram.fleet.centre.worker import work
 from engram.logs import logging_to_stderr
-from engram.maps.map import Map
 from engram.maps.map_files import copy_map
 from engram.processes import end_with_parent
 from engram.sqlite import is_full
@@ -228,9 +227,9 @@ def _copied(centre: Centre, draft: Path, names: list[str]) -> dict[str, int]:
     held = {}
     for name in names:
         path = draft / "maps" / f"{name}.engram"
-        copy_map(centre.map_path(name), path)
-        with Map.open(path) as store:
+        with centre.reading(name) as store:  # of a copy, no more than what is published
             held[name] = store.revision
+        copy_map(centre.map_path(name), path)
     objects = FolderObjects(draft / "objects")
     for prefix in ("packs", "manifests") if bucket is None else ():
         for key in centre.objects.keys(prefix):

@@ -22,7 +22,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-VERSION = 3
+VERSION = 4
 
 metadata = MetaData()
 Row = TypeVar("Row")
@@ -109,6 +109,17 @@ class MapListed:
     created_ns: int
     durable_revision: int  # the newest that a backup holds
     options: dict[str, Any]  # MapPolicy
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """What a map holds of which workers keep copies: its manifest lies among the objects."""
+
+    map: str
+    revision: int
+    stamp: str  # of the file at this revision
+    content_hash: str
+    manifest: str  # id of this publication
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,6 +314,7 @@ class Event:
 
 centre = _table("centre", Schema, "key")
 maps = _table("maps", MapListed, "name")
+published = _table("published", Published, "map")
 refs = _table("refs", Ref, "map", "name")
 subjects = _table("subjects", Account, "id")
 grants = _table("grants", Grant, "subject", "map")

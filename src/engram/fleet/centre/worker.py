@@ -17,7 +17,7 @@ import multiprocessing
 import os
 import shutil
 import signal
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -30,14 +30,13 @@ from engram.errors import EngramError, MapCorruptError, MapLockedError, StorageF
 from engram.fleet.centre import downloads, dreams, handins, jobs
 from engram.fleet.centre.database import first_row, note
 from engram.fleet.centre.fleet import move_ref
-from engram.fleet.centre.merge_job import JobMonitor, WaitsError, admit, merge_apart
+from engram.fleet.centre.merge_job import JobMonitor, admit, merge_apart
 from engram.fleet.centre.objects import written_ns
 from engram.fleet.centre.problems import StoreError
 from engram.fleet.centre.service import (
     DAY_NS,
     Centre,
     kept_since_ns,
-    manifest_key,
     needed_manifests,
 )
 from engram.fleet.centre.tables import Artifact, Dream, HandIn, JobState, artifacts, packs
@@ -99,13 +98,13 @@ def sweep(centre: Centre, name: str) -> int:
     return size
 
 
-def _mark(centre: Centre, name: str, manifests: Iterable[str], marks: _Marks) -> None:
+def _mark(centre: Centre, name: str, manifests: Mapping[str, str], marks: _Marks) -> None:
     """Adds the parts of manifests that are not marked yet, as far as they are there."""
     store = centre.packs(name)
-    for key in manifests:
+    for key, place in manifests.items():
         if key in marks:
             continue
-        manifest = decode_manifest(centre.objects.get(manifest_key(name, key)))
+        manifest = decode_manifest(centre.objects.get(place))
         pages = dict(store.read(dict.fromkeys(manifest.hashes())))
         marks[key] = set(pages)
         stored = {
@@ -118,7 +117,7 @@ def _mark(centre: Centre, name: str, manifests: Iterable[str], marks: _Marks) ->
 
 
 def _delete_forgotten(centre: Centre, name: str) -> None:
-    """Deletes packs that no row names: forgotten by the sweep before, or left by a kill."""
+    """Deletes what no row names: packs forgotten by the sweep before, or what a kill left."""
     limit_ns = min(kept_since_ns(centre), centre.now_ns() - DAY_NS)
     keys = [key.rsplit("/", 1)[1] for key in centre.objects.keys(f"packs/{name}")]
     with centre.database.reading() as connection:
@@ -126,6 +125,8 @@ def _delete_forgotten(centre: Centre, name: str) -> None:
     for pack in keys:
         if pack not in known and written_ns(pack) <= limit_ns:
             centre.objects.delete(f"packs/{name}/{pack}")
+    if centre.policy(name).copies:
+        centre.copies.clean(name, limit_ns)
 
 
 _NICENESS = 10
@@ -234,7 +235,8 @@ def dream_of(centre: Centre, row: Dream, scheduler: str | None = None) -> None:
         revision = _made_before(path, row.since)
     else:
         revision, shown["added"]["out"] = report.added.revision, row.map
-    jobs.set_state(centre, row, JobState.DONE, revision=revision, report=shown)
+    made = centre.prepared(row.map)
+    jobs.set_state(centre, row, JobState.DONE, made=made, revision=revision, report=shown)
     if policy.moves is not None and revision is not None:
         move_ref(centre, row.map, policy.moves, revision, "dream")
 
@@ -294,7 +296,7 @@ def work_off(centre: Centre, take: Callable[[Centre, HandIn], None] = merge_apar
                     settled += _make_downloads(centre, hindered)
                     take(centre, row)
                     settled += 1
-        except WaitsError as error:  # the next map may have its disk and its drives
+        except EngramError as error:  # the next map may have its disk and its drives
             hindered.append(error)
     settled += _make_downloads(centre, hindered)
     if hindered:

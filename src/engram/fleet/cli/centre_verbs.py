@@ -42,10 +42,13 @@ def open_centre(folder: Path) -> Centre:
     Raises:
         InputError: it is not there; `serve` and `map` make one, a mistyped name does not.
     """
+    from engram.fleet.centre.copies import keeps_copies
     from engram.fleet.centre.service import Centre
 
     database, objects = stores()
-    if not (folder / ("maps" if database else "centre.sqlite")).exists():
+    if not (folder / ("maps" if database else "centre.sqlite")).exists() and not (
+        database and objects and keeps_copies(database)
+    ):
         raise InputError(f"{folder}: there is no centre; start one: engram centre serve {folder}")
     return Centre(folder, database, objects)
 
@@ -78,6 +81,12 @@ def map_(
             help="Hours UTC in which the centre dreams, as 22-5; or none.",
         ),
     ] = None,
+    copies: Annotated[
+        bool,
+        typer.Option(
+            "--copies", help="Workers keep copies of all maps, each in a folder of its own."
+        ),
+    ] = False,
     settings: options.SettingsGiven,
 ) -> None:
     """Make a map, or change how its hand-ins are merged.
@@ -105,6 +114,8 @@ def map_(
         centre.add_map(name, BY)
         policy = replace(centre.policy(name), **changes)
         centre.set_policy(name, policy, BY)
+        for known in centre.map_names() if copies else ():
+            centre.keep_copies(known, BY)
     typer.echo(
         f"{name}: gate {', '.join(policy.gate) or NONE}, moves {policy.moves or NONE}, "
         f"quiet {NONE if policy.quiet is None else '{:g}-{:g}'.format(*policy.quiet)}"
@@ -281,7 +292,8 @@ def worker(
 ) -> None:
     """Merge hand-ins, make downloads and dream until stopped.
 
-    Any number of workers may run. Each takes a map that has work and no other worker.
+    Any number of workers may run. Each takes a map that has work and no other worker. They share
+    FOLDER, unless engram centre map --copies lets each have its own.
 
     \b
     Examples:
