@@ -65,8 +65,9 @@ INTRODUCTION = (
 MEANING = (
     "Localised: the frame matched a node, a frame kept in the map, well enough to measure its pose "
     "from there. gap: the longest distance between two matches. inliers: landmarks that agree with "
-    "that pose; error: of its position, by the simulator's truth (both medians). false: a match "
-    "more than 1 m or 5° off. Frames are 1.4 m apart to save time; engram doctor warns of that."
+    "that pose, their median; error: of its position relative to the node, by the simulator's "
+    "truth, its median. false: a match more than 1 m or 5° off. Frames are 1.4 m apart to save "
+    "time: engram doctor warns of so few a second."
 )
 LIMITS = (
     "This is a simulation. On real images, with an earlier version: KITTI 06, its first 5 s, every "
@@ -78,8 +79,15 @@ _LANDMARKS_ONLY = (
     "ms a frame: on this machine, from the log's landmarks. From images: README.md, What a robot "
     "needs."
 )
-OWN_DRIVES = "Your own drive, a ROS bag or a folder of stereo images (docs/data.md):"
-OWN_COMMANDS = ("engram doctor DRIVE", "engram map town.engram DRIVE")
+OWN_DRIVES = (
+    "Your own drives, ROS bags or folders of stereo images (docs/data.md; on a robot: "
+    "docs/live.md, docs/ros.md; a fleet: docs/fleet-tutorial.md):"
+)
+OWN_COMMANDS = (
+    "engram doctor DRIVE",
+    "engram map town.engram DRIVE",
+    "engram localise town.engram ANOTHER_DRIVE --report page.html",
+)
 
 
 def demo_campaign() -> Campaign:
@@ -282,8 +290,9 @@ class DemoReport:
             "Merging finds matches between the maps, which tie them together. The fleet's map "
             f"takes {took} nodes; the others matched what it has. scout downloads "
             f"{self.downloaded_bytes / 1e6:.1f} of {self.of_bytes / 1e6:.1f} MB of it: the nodes "
-            f"that spare a drive at {_DEPARTS_H:.0f} o'clock most failures for their size. The "
-            f"hour does not determine the light, so some are of other hours: {sent}.{self._used()}"
+            f"expected to prevent most failures per byte on a drive at {_DEPARTS_H:.0f} o'clock. "
+            f"Weather may bring the light of other hours, so some are of these: "
+            f"{sent}.{self._used()}"
         )
 
     def _used(self) -> str:
