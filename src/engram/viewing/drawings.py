@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import io
 import re
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +23,8 @@ from engram.counts import counted
 from engram.errors import InputError, extra
 from engram.files import check_output
 from engram.graph.clock import hour_of_day
-from engram.graph.model import Anchor, Session
+from engram.graph.graph import grouped
+from engram.graph.model import Anchor, NodeId
 from engram.graph.placing import held_by_anchors
 from engram.maps.difference import MapDifference
 from engram.maps.map import Map
@@ -162,8 +162,7 @@ class Track:
         """The (K, 2) points of each line, metres in the map frame, K >= 2."""
         if self.chain is None:
             return []
-        lines = (self.points_m[self.chain == one] for one in np.unique(self.chain))
-        return [line for line in lines if len(line) > 1]
+        return [self.points_m[rows] for rows in grouped(self.chain) if len(rows) > 1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,8 +241,10 @@ def _draw_track(axes: Any, track: Track, colour: str) -> None:
     axes.plot(x, y, track.mark, color=colour, markersize=3 if lines else 5)
     if track.label:
         axes.plot([], [], "-" if lines else track.mark, color=colour, label=_shown(track.label))
-    for line in lines:
-        axes.plot(line[:, 0], line[:, 1], "-", color=colour, linewidth=1.4, alpha=0.8)
+    if lines:  # one artist for all of them, with gaps between
+        gap = np.full((1, 2), np.nan)
+        drawn = np.concatenate([part for line in lines for part in (line, gap)])
+        axes.plot(drawn[:, 0], drawn[:, 1], "-", color=colour, linewidth=1.4, alpha=0.8)
     spacing_m = max(float(np.ptp(track.points_m, axis=0).max(initial=0.0)) / _ARROWS, 1.0)
     for place, heading_rad in _arrows(lines, spacing_m):
         marker = (3, 0, float(np.rad2deg(heading_rad)) - 90.0)
@@ -280,35 +281,42 @@ def _series(track: Track) -> str:
     return track.label.split(" (")[0]
 
 
-def _by_session(placed: PlacedNodes, label: Callable[[Session], str]) -> list[str]:
-    labels = [label(session) for session in placed.sessions]
-    return [labels[number] for number in placed.session.tolist()]
+# Distinct names, and the (N,) int64 name of each node.
+_Named: TypeAlias = tuple[list[str], NDArray[np.int64]]
 
 
-def _experiences(placed: PlacedNodes) -> list[str]:
-    return _by_session(placed, drive_text)
+def _named(names: Sequence[str], of_node: NDArray[np.int64]) -> _Named:
+    """What N nodes are called by the (N,) numbers of names, of which some may be equal."""
+    distinct = sorted(set(names))
+    number = {name: at for at, name in enumerate(distinct)}
+    return distinct, np.array([number[name] for name in names], np.int64)[of_node]
 
 
-def _hours(placed: PlacedNodes) -> list[str]:
+def _experiences(placed: PlacedNodes) -> _Named:
+    return _named([drive_text(session) for session in placed.sessions], placed.session)
+
+
+def _hours(placed: PlacedNodes) -> _Named:
     # Within a second the hour of a drive is looked up once.
     seconds = np.stack([placed.session, placed.stamp_ns // 1_000_000_000], axis=1)
     times, which = np.unique(seconds, axis=0, return_inverse=True)
-    labels = []
+    names = []
     for session, second in times.tolist():
         hour = hour_of_day(placed.sessions[session], second * 1_000_000_000)
-        labels.append("hour unknown" if hour is None else f"{int(hour):02d} h")
-    return [labels[at] for at in which.ravel().tolist()]
+        names.append("hour unknown" if hour is None else f"{int(hour):02d} h")
+    return _named(names, which.ravel())
 
 
-def _revisions(placed: PlacedNodes) -> list[str]:
-    return [f"revision {number:3d}" for number in placed.revision.tolist()]
+def _revisions(placed: PlacedNodes) -> _Named:
+    numbers, which = np.unique(placed.revision, return_inverse=True)
+    return _named([f"revision {number:3d}" for number in numbers.tolist()], which)
 
 
-def _robots(placed: PlacedNodes) -> list[str]:
-    return _by_session(placed, lambda session: session.robot)
+def _robots(placed: PlacedNodes) -> _Named:
+    return _named([session.robot for session in placed.sessions], placed.session)
 
 
-COLOURS: Mapping[str, Callable[[PlacedNodes], list[str]]] = {
+COLOURS: Mapping[str, Callable[[PlacedNodes], _Named]] = {
     "experience": _experiences,
     "hour": _hours,
     "revision": _revisions,
@@ -361,14 +369,18 @@ class MapAbove:
 
     def labels(self, by: str) -> Labels:
         """What colours the nodes, by a key of `COLOURS`."""
-        names = np.array(COLOURS[by](self.placed), dtype=str)
-        counts = Counter(names.tolist())
-        largest = sorted(name for name, _ in counts.most_common(_NAMED))
-        place = {name: number for number, name in enumerate(largest)}
-        of_node = np.array([place.get(name, len(largest)) for name in names.tolist()], np.int64)
+        names, called = COLOURS[by](self.placed)
+        counts = np.bincount(called, minlength=len(names))
+        # Names that no node has come last, and are not named.
+        frequent = np.argsort(-counts, kind="stable")[: min(_NAMED, np.count_nonzero(counts))]
+        kept = np.sort(frequent)
+        largest = [names[at] for at in kept.tolist()]
+        number_of = np.full(len(names), len(largest), np.int64)
+        number_of[kept] = np.arange(len(largest))
+        of_node = number_of[called]
         colours = [PALETTE[number % len(PALETTE)] for number in range(len(largest))]
-        if len(counts) > len(largest):
-            largest.append(f"{len(counts) - len(largest)} more")
+        if (others := np.count_nonzero(counts) - len(largest)) > 0:
+            largest.append(f"{others} more")
             colours.append(_FEW)
         return Labels(tuple(largest), tuple(colours), of_node)
 
@@ -376,13 +388,26 @@ class MapAbove:
 def map_above(opened: Map) -> MapAbove:
     """A map from above, as of its revision."""
     placed = opened.placed()
-    row_of = {uuid.tobytes(): row for row, uuid in enumerate(placed.uuids)}
+    named = [goal.node for goal in opened.goals.values()]
+    named += [anchor.node for anchor in opened.anchors]
+    row_of = _rows_of(placed, named)
     part = _by_size(_in_one_frame(placed.component, row_of, opened.anchors))
     goals = {}
     for name, goal in sorted(opened.goals.items()):
         place = opened.frame.locate(goal)
         goals[name] = int(part[row_of[goal.node.bytes]]), place.x_m, place.y_m
     return MapAbove(placed, placed.positions[:, :2], part, _starts(placed), goals)
+
+
+def _rows_of(placed: PlacedNodes, wanted: Sequence[NodeId]) -> dict[bytes, int]:
+    """The rows of some nodes, as far as they are placed."""
+    if not wanted:
+        return {}
+    ids = {node.bytes for node in wanted}
+    first = np.ascontiguousarray(placed.uuids).view(np.uint64).reshape(-1, 2)[:, 0]
+    likely = np.isin(first, np.frombuffer(b"".join(ids), np.uint64)[::2])
+    found = ((placed.uuids[row].tobytes(), row) for row in np.flatnonzero(likely).tolist())
+    return {uuid: row for uuid, row in found if uuid in ids}
 
 
 def _in_one_frame(
