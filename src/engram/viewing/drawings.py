@@ -489,7 +489,8 @@ def _tracks(above: MapAbove, labels: Labels, chosen: NDArray[np.bool_]) -> list[
         if count := int(which.sum()):
             chains = above.placed.experience[which]
             label = f"{name} ({counted(count, 'node')})"
-            tracks.append(Track(label, above.points_m[which], colour, chains, above.starts[which]))
+            starts = None if colour == _FEW else above.starts[which]
+            tracks.append(Track(label, above.points_m[which], colour, chains, starts))
     return tracks
 
 
