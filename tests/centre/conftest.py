@@ -20,7 +20,7 @@ from engram.fleet.centre import merge_job
 from engram.fleet.centre.access import Role, add_person, new_code
 from engram.fleet.centre.application import create_app
 from engram.fleet.centre.merge_job import write_checked
-from engram.fleet.centre.service import Centre, MapPolicy
+from engram.fleet.centre.service import Centre, CentreSettings, MapPolicy
 from engram.fleet.centre.worker import work_off
 from engram.fleet.merge.merge_settings import MergeOptions
 from engram.maps.map import Map, open_map
@@ -169,9 +169,11 @@ def apart(request, tmp_path):
     if request.param == "services":
         objects = f"{request.getfixturevalue('s3')}/{uuid.uuid4().hex}"
         database = new_database()
-    found = Site(tmp_path / "first", database=database, objects=objects)
+    # Workers die more often than a hand-in may be the cause of.
+    settings = CentreSettings(merge_tries=1_000)
+    found = Site(tmp_path / "first", database=database, objects=objects, settings=settings)
     found.centre.keep_copies(NAME, "tests")
-    with Centre(tmp_path / "second", database, objects, clock=found.clock) as other:
+    with Centre(tmp_path / "second", database, objects, settings, found.clock) as other:
         yield found, other
     found.close()
     if request.param == "services":

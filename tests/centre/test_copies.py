@@ -182,7 +182,7 @@ def kill_at_random(site: Site, other: Centre, kills: int, seed: int) -> None:
             drives += 1
             hand_in(site, f"r{rng.randrange(3)}", 1_000 * drives)
         at = rng.randrange(2)
-        with dying(rng.randrange(1, 45)) as death:
+        with dying(rng.randrange(1, 30)) as death:
             try:
                 work(centres[at])
             except BaseException:
@@ -208,9 +208,9 @@ def test_kills_at_random_steps_lose_nothing_and_merge_nothing_twice(apart, seed)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_many_kills_lose_nothing_and_merge_nothing_twice(apart, seed):
-    kill_at_random(*apart, kills=30, seed=100 + seed)
+    kill_at_random(*apart, kills=15, seed=100 + seed)
 
 
 def test_a_worker_that_lost_its_lane_publishes_nothing(apart, monkeypatch):
