@@ -303,8 +303,11 @@ STUDIES: Mapping[str, Study] = {
         resumes=True,
     ),
     "scale": Study(
-        (f"{_EVALUATE}scale --maps {{out}}/maps --out {{out}}/scale.md --json",),
-        15,
+        (
+            f"{_EVALUATE}scale --sizes 7500,100000,1000000 --maps {{out}}/maps "
+            "--out {out}/scale.md --json",
+        ),
+        40,
         ("1.txt", "scale.md"),
         ("docs/evidence.md", "lab/reports/performance.md"),
         town=False,

@@ -137,6 +137,71 @@ def kills(tables: Path) -> Iterator[str]:
     yield "(`python -m engram_lab.checks.kill_mapping`)."
 
 
+# What a city costs, by the names that the study of its growth gives to parts of a row.
+_COSTS: Mapping[str, tuple[str, ...]] = {
+    "open and first step at a known place, s": ("open and first step (s)",),
+    "a step; its 99th percentile, ms": ("step (ms)", "step, 99th percentile (ms)"),
+    "lost: open and first proposals, s": ("lost: open and first proposals (s)",),
+    "mapping: open and first step, s; a step, ms": (
+        "mapping: open and first step (s)",
+        "mapping: step (ms)",
+    ),
+    "memory of a robot; lost; mapping, MB": (
+        "memory (MB)",
+        "lost: memory (MB)",
+        "mapping: memory (MB)",
+    ),
+    "commit of 1; 50 nodes, s": ("commit, 1 nodes (s)", "commit, 50 nodes (s)"),
+    "`info`; `log`; `show NODE`, s": ("info (s)", "log (s)", "show NODE (s)"),
+    "`diff`; `check --since`; `revert` of a drive, s": (
+        "diff (s)",
+        "check --since (s)",
+        "revert (s)",
+    ),
+    "merge of 50; 500 nodes, beyond the replay, s": (
+        "merge, 50 nodes, beyond the replay (s)",
+        "merge, 500 nodes, beyond the replay (s)",
+    ),
+    "download of a region; by hour and paths; by bytes, of 2,000 nodes, s": (
+        "download region, 2,000 nodes (s)",
+        "download tod+paths of 2,000 nodes (s)",
+        "download 5 MB of 2,000 nodes (s)",
+    ),
+    "`plot`, s": ("plot (s)",),
+}
+
+
+def _cities(tables: Path) -> list[dict[str, float]]:
+    """The figures of each city, the smallest first."""
+    cities: list[dict[str, float]] = json.loads((tables / "scale/1.txt").read_text("utf-8"))
+    return sorted(cities, key=lambda one: one["nodes"])
+
+
+def scale(tables: Path) -> Iterator[str]:
+    """What grows with the map, and what does not."""
+    cities = _cities(tables)
+    sizes = (f"{int(one['nodes']):,}" for one in cities)
+    yield f"| processor time; nodes | {' | '.join(sizes)} |"
+    yield "| --- |" + " --- |" * len(cities)
+    for words, names in _COSTS.items():
+        cells = ("; ".join(f"{one[name]:.2g}" for name in names) for one in cities)
+        yield f"| {words} | {' | '.join(cells)} |"
+
+
+def scale_in_short(tables: Path) -> Iterator[str]:
+    """The largest city, for docs/evidence.md."""
+    city = _cities(tables)[-1]
+    yield (
+        f"In a synthetic city of {int(city['nodes']):,} nodes a robot takes its first step after "
+        f"{city['open and first step (s)']:.2f} s of processor time, with "
+        f"{city['memory (MB)']:.0f} MB. A lost one has its"
+    )
+    yield (
+        f"first proposals after {city['lost: open and first proposals (s)']:.2f} s, with "
+        f"{city['lost: memory (MB)']:.0f} MB (`lab/reports/performance.md`)."
+    )
+
+
 # Conditions, as docs/eyes.md has them.
 _SEEN = ("morning / night", "morning / snow", "rain / rain again")
 
@@ -418,6 +483,8 @@ BLOCKS: Mapping[str, Block] = {
     "robot-needs": Block("robot-needs", robot_needs),
     "eyes": Block("eyes", eyes),
     "kills": Block("kills", kills),
+    "scale": Block("scale", scale),
+    "scale-in-short": Block("scale", scale_in_short),
     "ranking": Block("ranking", ranking),
     "starved": Block("starved", starved),
     "conditions": Block("conditions", conditions),
