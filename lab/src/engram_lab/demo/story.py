@@ -70,10 +70,9 @@ MEANING = (
     "time: engram doctor warns of so few a second."
 )
 LIMITS = (
-    "This is a simulation. On real images, with an earlier version: KITTI 06, its first 5 s, every "
-    "other frame mapped and the rest localised (an easy test): 100 %, median error 1.05 cm; EuRoC "
-    "V1_01, 85 revisits of a room: 97.6 % within 0.25 m. Rain, snow and what fails: "
-    "docs/evidence.md."
+    "This is a simulation. On real images: KITTI 06, its first 5 s, every other frame mapped and "
+    "the rest localised (an easy test): 100 %, median error 1.05 cm; EuRoC V1_01, 85 revisits of a "
+    "room: 97.6 % within 0.25 m. Rain, snow and what fails: docs/evidence.md."
 )
 _LANDMARKS_ONLY = (
     "ms a frame: on this machine, from the log's landmarks. From images: README.md, What a robot "

@@ -261,7 +261,7 @@ STUDIES: Mapping[str, Study] = {
         (f"{_EVALUATE}faults --only equal-fronts --live 3 --json",),
         30,
         ("1.txt",),
-        ("docs/evidence.md", "lab/reports/lookalikes.md"),
+        ("lab/reports/lookalikes.md",),
     ),
     "eyes": Study(
         (f"{_CHECKS}eyes --kinds brief,net --out {{out}}/eyes",),

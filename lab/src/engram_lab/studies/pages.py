@@ -178,14 +178,20 @@ def _cities(tables: Path) -> list[dict[str, float]]:
 
 
 def scale(tables: Path) -> Iterator[str]:
-    """What grows with the map, and what does not."""
-    cities = _cities(tables)
+    """What grows with the map, and what does not: the smallest and the largest city."""
+    known = _cities(tables)
+    cities = [known[0], known[-1]]
     sizes = (f"{int(one['nodes']):,}" for one in cities)
     yield f"| processor time; nodes | {' | '.join(sizes)} |"
     yield "| --- |" + " --- |" * len(cities)
     for words, names in _COSTS.items():
-        cells = ("; ".join(f"{one[name]:.2g}" for name in names) for one in cities)
+        cells = ("; ".join(_digits(one[name]) for name in names) for one in cities)
         yield f"| {words} | {' | '.join(cells)} |"
+
+
+def _digits(value: float) -> str:
+    """Two digits, or all before the point."""
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
 def scale_in_short(tables: Path) -> Iterator[str]:
