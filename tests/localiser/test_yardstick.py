@@ -63,7 +63,8 @@ USUAL = Likeness(share=float(np.log(0.7)), more_bits=3.0, unevenness=2.0)
 
 
 def after(*found: Likeness, step_m: float = 2.0, run: Run | None = None, at_m: float = 0.0) -> Run:
-    run = run or Run(LookalikeConfig())
+    """A run after matches; edges wait for log-odds of 4."""
+    run = run or Run(LookalikeConfig(edges=4.0))
     for number, one in enumerate(found):
         if run.due(at_m + number * step_m):
             run.add(one.alike(), at_m + number * step_m)

@@ -74,9 +74,10 @@ class LookalikeConfig:
         Meta(
             ge=0,
             description="log-odds that a run is not of look-alikes, from which its matches "
-            "create edges",
+            "create edges; 4 keeps streets of equal fronts apart, but weak matches before it are "
+            "not saved, and merges store them twice",
         ),
-    ] = 4.0
+    ] = 0.08
     most: Annotated[
         float,
         Meta(
