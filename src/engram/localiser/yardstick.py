@@ -289,7 +289,7 @@ class Run:
     Attributes:
         believed: whether its matches are accepted.
         proved: whether they showed enough of what matches usually have for edges: a wrong one
-            folds the map permanently, a late one costs nothing.
+            folds the map permanently.
     """
 
     def __init__(self, config: LookalikeConfig) -> None:
