@@ -341,7 +341,7 @@ def test_a_file_that_others_left_behind_is_not_published(apart):
 
 def test_copies_need_stores_that_all_workers_reach(site):
     if None not in site.centre.addresses:
-        pytest.skip("they are elsewhere")
+        pytest.skip("the tables and parts of this site are where all workers reach them")
     with pytest.raises(InputError, match="set ENGRAM_DATABASE and ENGRAM_OBJECTS"):
         site.centre.keep_copies(NAME, "tests")
     assert not site.centre.policy(NAME).copies

@@ -425,10 +425,10 @@ class Centre:
 
     @contextmanager
     def changing(self, name: str) -> Iterator[Map]:
-        """A map, locked to be changed by a person; see `published`.
+        """A map, locked to be changed by a person; see `prepared`.
 
         Raises:
-            UnknownError: there is none.
+            UnknownError: there is no such map.
             MapLockedError: a worker has it.
         """
         path = self.map_path(name)
@@ -452,7 +452,7 @@ class Centre:
         """The row of a map.
 
         Raises:
-            UnknownError: there is none.
+            UnknownError: there is no such map.
         """
         row = self.database.row(MapListed, maps.c.name == name) if _NAME.fullmatch(name) else None
         if row is None:
@@ -463,7 +463,7 @@ class Centre:
         """The file of a map, which holds what is published if it is a copy.
 
         Raises:
-            UnknownError: there is none.
+            UnknownError: there is no such map.
             StoreError, MapError: a copy cannot be brought up to date now.
         """
         self._brought(name)
@@ -473,7 +473,7 @@ class Centre:
         """A map as of its newest revision, which stays open for the next one who asks.
 
         Raises:
-            UnknownError: there is none.
+            UnknownError: there is no such map.
             StoreError, MapError: a copy cannot be brought up to date now.
         """
         published = self._brought(name)
