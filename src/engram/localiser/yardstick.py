@@ -74,16 +74,16 @@ class LookalikeConfig:
         Meta(
             ge=0,
             description="log-odds that a run is not of look-alikes, from which its matches "
-            "create edges; 4 keeps streets of equal fronts apart, but weak matches before it are "
-            "not saved, and merges store them twice",
+            "create edges; with 4 fewer edges join streets of equal fronts, but weak matches "
+            "before it are not saved, and merges store them twice",
         ),
     ] = 0.08
     most: Annotated[
         float,
         Meta(
             gt=0,
-            description="log-odds that a run is not of look-alikes, from which it is judged no "
-            "more while its matches are predicted; also the greatest that it is one",
+            description="log-odds that a run is not of look-alikes, from which it is no "
+            "longer judged while its matches are predicted; also the upper bound of a run",
         ),
     ] = 8.0
     apart_m: Annotated[
@@ -283,8 +283,8 @@ class Likeness:
 class Run:
     """The log-odds that a run of matches is one of look-alikes.
 
-    A run that has shown enough that it is none stays believed: where fronts were rebuilt a robot
-    that odometry and the map agree on cannot have come to another street.
+    Once a run has shown enough it stays believed: while odometry and the map agree, a robot cannot
+    have come to another street, even where fronts were rebuilt.
 
     Attributes:
         believed: whether its matches are accepted.
