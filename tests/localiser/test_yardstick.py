@@ -63,8 +63,8 @@ USUAL = Likeness(share=float(np.log(0.7)), more_bits=3.0, unevenness=2.0)
 
 
 def after(*found: Likeness, step_m: float = 2.0, run: Run | None = None, at_m: float = 0.0) -> Run:
-    """A run after matches; edges wait for log-odds of 4."""
-    run = run or Run(LookalikeConfig(edges=4.0))
+    """A run after matches."""
+    run = run or Run(LookalikeConfig())
     for number, one in enumerate(found):
         if run.due(at_m + number * step_m):
             run.add(one.alike(), at_m + number * step_m)
@@ -83,6 +83,17 @@ def test_edges_wait_for_more_than_a_first_match_shows() -> None:
     assert not after(USUAL).proved
     assert after(*[USUAL] * 4).proved
     assert not after(*[replace(USUAL, unevenness=2.8)] * 4).proved
+
+
+def test_a_robot_that_measured_its_way_into_the_map_proves_itself_only_after_a_doubt() -> None:
+    run = Run(LookalikeConfig())
+    run.begin(measured=True)
+    assert after(USUAL, run=run).proved
+    assert not after(*[LOOKALIKE] * 20, USUAL, run=run, at_m=2.0).proved
+    run.begin(measured=True)
+    # After 31 m without a match it is a run like any other.
+    after(USUAL, run=run)
+    assert not after(USUAL, run=run, at_m=31.0).proved
 
 
 def test_a_run_that_has_shown_enough_is_judged_no_more_until_it_breaks() -> None:

@@ -14,7 +14,7 @@ from tests.builders import Mapped, Seen, World, drive, session_for
 from engram.frontend.frame import Frame
 from engram.frontend.matching import NO_MATCH, Match
 from engram.geometry.se3 import SE3
-from engram.graph.model import Attempt, NodeId, PathEntry, Session, path_id
+from engram.graph.model import Attempt, NodeId, PathEntry, PathEntryKind, Session, path_id
 from engram.localiser.acceptance import Prediction, Spread
 from engram.localiser.attempts import Lanes, one_by_one
 from engram.localiser.localisation import Position
@@ -28,6 +28,7 @@ from engram.robot.localisers import localiser_in
 from engram.robot.robot import Robot
 from engram.robot.settings import Settings
 from engram.robot.starting import summarise
+from engram.testing.contracts import make_node
 from engram.viewing.trajectory import chain_trajectory
 
 ROAD = World(length_m=120.0, seed=11)
@@ -157,6 +158,19 @@ def test_a_mapping_robot_joins_nothing_by_a_fix_that_nothing_confirms(town: Path
         own = graph.sessions == graph.session_number(session.id)
         labels = graph.components()
     assert found[0].localised
+    assert found[0].saved is not None  # it matched weakly
     assert sum(one.saved is not None for one in found) > 15
     assert not set(labels[own]) & set(labels[~own])
     assert len(set(labels[own])) == 1
+
+
+def test_a_saved_node_is_visited_though_its_match_is_withdrawn() -> None:
+    notes, saved, matched = Notes(), make_node(0, 1), make_node(1, 0)
+    saver = Saver(notes, path_id(saved.session))
+    saver.put(Records(0, visit=(matched.id, PathEntryKind.MATCHED)), held_back=2)
+    saver.put(Records(1, node=saved, visit=(saved.id, PathEntryKind.SAVED)), held_back=2)
+    saver.withdraw(0)
+    saver.withdraw(1)
+    saver.put(Records())
+    saver.finish()
+    assert [entry.node for entry in notes.entries] == [saved.id]

@@ -491,7 +491,7 @@ class Fixes:
         self._told = not agreed
         self._record.forget(agreed)
         self._chain.settle()
-        self._run.begin()
+        self._run.begin(measured=agreed > 0)
 
     def settled(self) -> None:
         """The live frame was saved as a node, which is the position from now on."""

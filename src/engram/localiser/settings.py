@@ -23,7 +23,7 @@ from engram.ranking.recent import RecentConfig
 
 # Raise it when equal settings give different results: stored studies of another version are not
 # continued.
-METHOD_VERSION = 26
+METHOD_VERSION = 27
 
 
 class NeighbourhoodSearch(StrEnum):

@@ -73,11 +73,10 @@ class LookalikeConfig:
         float,
         Meta(
             ge=0,
-            description="log-odds that a run is not of look-alikes, from which its matches "
-            "create edges; with 4 fewer edges join streets of equal fronts, but weak matches "
-            "before it are not saved, and merges store them twice",
+            description="log-odds that a run is not of look-alikes, from which its matches create "
+            "edges; until then these wait",
         ),
-    ] = 0.08
+    ] = 4.0
     most: Annotated[
         float,
         Meta(
@@ -297,10 +296,17 @@ class Run:
         self._alike = 0.0
         self._at_m: float | None = None
         self.believed = self.proved = True
+        self._measured = False
 
-    def begin(self) -> None:
-        """The next match is of another run."""
+    def begin(self, *, measured: bool = False) -> None:
+        """The next match is of another run.
+
+        Args:
+            measured: whether the robot measured its way into the map before: until its matches
+                are doubted, they create edges without another proof.
+        """
         self._alike, self._at_m, self.believed, self.proved = 0.0, None, True, True
+        self._measured = measured
 
     def due(self, driven_m: float) -> bool:
         """Whether a match after so many metres says more than those before."""
@@ -326,7 +332,7 @@ class Run:
             self.believed = self._alike <= (config.doubt_first if first else config.doubt)
         else:
             self.believed = self._alike <= -config.proof
-        shown = self._alike <= -config.edges or (self.proved and not first)
+        shown = self._alike <= -config.edges or (self.proved and (self._measured or not first))
         self.proved = self.believed and shown
 
 

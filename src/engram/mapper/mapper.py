@@ -153,11 +153,12 @@ class Saver:
                 ) from None
 
     def withdraw(self, stamp_ns: int) -> None:
-        """A later frame disproved the match of this one: no visit, and failed attempts."""
+        """A later frame disproved the match: the attempts failed; visited is only a saved node."""
         for at, one in enumerate(self._held):
             if one.stamp_ns == stamp_ns:
                 failed = [replace(attempt, accepted=False) for attempt in one.attempts]
-                self._held[at] = replace(one, attempts=failed, visit=None)
+                visit = None if one.node is None else one.visit
+                self._held[at] = replace(one, attempts=failed, visit=visit)
 
     def finish(self) -> None:
         """Writes what is queued, checkpoints and ends the thread; what is held back is dropped."""
@@ -574,8 +575,8 @@ class Mapper(Memory):
         if result.localised:
             edges += self._join(result)
         if self._looks_new(result) and self._worth_saving(live, result.motion):
-            save = self._save_matched if result.localised else self._save
-            saved, laid = save(live, result.measured)
+            tied = result.localised and not self._localiser.on_trial
+            saved, laid = (self._save_matched if tied else self._save)(live, result)
             edges += laid
             visit = saved.id, PathEntryKind.SAVED
         attempts = self._localiser.attempts()
@@ -662,10 +663,8 @@ class Mapper(Memory):
             )
 
     def _looks_new(self, result: Localisation) -> bool:
-        """Whether the frame's view is new to the map; a match on trial does not decide that."""
-        if not result.localised:
-            return True
-        return result.inliers < self.config.sure_inliers and not self._localiser.on_trial
+        """Whether the frame's view is new to the map."""
+        return not result.localised or result.inliers < self.config.sure_inliers
 
     def _worth_saving(self, live: Frame, motion: Motion) -> bool:
         """Whether a frame is usable and far enough from the last saved one (method §5).
@@ -682,23 +681,27 @@ class Mapper(Memory):
             or moved.angle_rad >= self.config.save_every_rad
         )
 
-    def _save(self, live: Frame, position: Position | None) -> tuple[Node, list[Edge]]:
-        """Saves the frame as a node, chained to the experience or tied to where it began."""
-        node = self._node_of(live)
-        edges = []
+    def _save(self, live: Frame, result: Localisation) -> tuple[Node, list[Edge]]:
+        """Saves the frame as a node, chained to the experience or tied to where it began.
+
+        So is a frame that matched weakly on trial: if the match is withdrawn, the chain stays.
+        """
+        node, position, edges = self._node_of(live), result.measured, []
         unknown = self._localiser.contradicted
         if self._since_saved is None or unknown:
             self._joined = len(self._graph) == 1  # motion from earlier nodes is unknown
             self._alone_from_m = self._localiser.driven_m
-        if self._experience and self._since_saved is not None:
+        begins = not self._experience
+        if not begins and self._since_saved is not None:
             edges.append(_edge(self._since_saved, node.id, EdgeKind.ODOMETRY))
-        elif not self._experience and position is not None and self._localiser.certain:
+        if position is not None and self._localiser.certain and (begins or result.localised):
             tie = _edge(position, node.id, EdgeKind.TIE)
             if self._localiser.on_trial:
                 self._wait_with([tie])
             elif not unknown:
                 edges.append(tie)
-            edges += self._edge_to_last_saved(position, node.id, EdgeKind.TIE)
+            if begins:
+                edges += self._edge_to_last_saved(position, node.id, EdgeKind.TIE)
         self._graph.add_edges(edges)
         edges += self._beside(node.id)
         self._experience.append(node.id)
@@ -707,8 +710,9 @@ class Mapper(Memory):
             self._localiser.settle_in(node.id)
         return node, edges
 
-    def _save_matched(self, live: Frame, position: Position | None) -> tuple[Node, list[Edge]]:
+    def _save_matched(self, live: Frame, result: Localisation) -> tuple[Node, list[Edge]]:
         """Saves a frame that matched weakly: tied by its match, and chained to the last one."""
+        position = result.measured
         assert position is not None
         node = self._node_of(live)
         tie = _edge(position, node.id, EdgeKind.TIE)
