@@ -229,12 +229,11 @@ def localise(
     sequence, given = drive.open(path, settings)
     from engram.cli.localising import Outputs, explain_and_print, localise_and_print
     from engram.maps.map import open_map
-    from engram.robot.explaining import ExplainOptions
     from engram.robot.settings import RobotOptions
 
-    resolved, tried = given.of_robot(), effort.over(given)
+    resolved = given.of_robot()
+    asked = RobotOptions(**effort.over(given), deadline_ms=deadline)
     if explain is None:
-        asked = RobotOptions(**tried, deadline_ms=deadline)
         wanted = Outputs(
             map_path,
             path,
@@ -260,9 +259,8 @@ def localise(
     }  # fmt: skip
     for option in (option for option, value in refused.items() if value is not None):
         raise ConfigError(f"--explain is about one frame; leave out {option}")
-    names = ("ranking", "lanes", "rounds", "relocaliser")
-    frame = ExplainOptions(explain, **{name: tried[name] for name in names}, at=at)
-    explain_and_print(map_path, sequence, resolved, frame, as_json=as_json)
+    with open_map(map_path, at) as opened:
+        explain_and_print(opened, sequence, explain, resolved, asked, as_json=as_json)
 
 
 def record(

@@ -16,7 +16,7 @@ from engram.errors import InputError
 if TYPE_CHECKING:
     from engram.localiser.localisation import Localisation
     from engram.maps.map import Map
-    from engram.robot.explaining import ExplainedCandidate, ExplainOptions, Explanation
+    from engram.robot.explaining import ExplainedCandidate, Explanation
     from engram.robot.recorder import Recorder
     from engram.robot.results import ResultRecords
     from engram.robot.robot import LastFrame, Robot
@@ -224,17 +224,18 @@ _LISTED = 20
 
 
 def explain_and_print(
-    map_path: Path,
+    opened: Map,
     sequence: Drive,
+    number: int,
     settings: Settings,
-    asked: ExplainOptions,
+    asked: RobotOptions,
     *,
     as_json: bool,
 ) -> None:
     """Localises the drive up to a frame and says how its candidates were ordered."""
     from engram.robot.explaining import explain_frame
 
-    found = explain_frame(map_path, sequence, settings, asked)
+    found = explain_frame(opened, sequence, number, settings, asked)
     show(found.to_dict(), partial(_explained_text, found), as_json=as_json)
 
 

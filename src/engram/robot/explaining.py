@@ -6,7 +6,6 @@ import math
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,40 +13,15 @@ from numpy.typing import NDArray
 
 from engram.errors import ConfigError
 from engram.graph.model import Clock, NodeId, SessionId
-from engram.localiser.localisation import Localisation, LocalisationStatus
-from engram.maps.map import Map, open_map
+from engram.localiser.localisation import LocalisationStatus
+from engram.maps.map import Map
 from engram.ranking.context import Foreseen, RankingContext, RankingPolicy, Reasons, reasons_of
-from engram.ranking.policies import check_for_robot, policy_named
+from engram.ranking.policies import policy_named
 from engram.robot.front import arriving
 from engram.robot.localisers import DriveSequence
 from engram.robot.robot import LastFrame
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import robot_on
-
-
-@dataclass(frozen=True, slots=True)
-class ExplainOptions:
-    """Options of `explain_frame`.
-
-    Attributes:
-        frame: number of the frame in the drive, from 0.
-        ranking: which nodes to try first: key of `POLICIES`.
-        lanes, rounds: the budget of each frame up to and including this one.
-        relocaliser: one of `relocaliser_names()`; None for none.
-        at: number or tag of the map's revision; None for the newest.
-    """
-
-    frame: int
-    ranking: str = "recall"
-    lanes: int = 2
-    rounds: int = 2
-    relocaliser: str | None = "fabmap"
-    at: int | str | None = None
-
-    def __post_init__(self) -> None:
-        check_for_robot(self.ranking)
-        if self.frame < 0:
-            raise ConfigError(f"frame is {self.frame}, must be 0 or more")
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +133,7 @@ class _Watching:
 
 
 def explain_frame(
-    map_path: Path, sequence: DriveSequence, settings: Settings, options: ExplainOptions
+    opened: Map, sequence: DriveSequence, number: int, settings: Settings, options: RobotOptions
 ) -> Explanation:
     """Localises a drive up to a frame, and explains the order of its candidates.
 
@@ -167,36 +141,40 @@ def explain_frame(
     budget allows.
 
     Args:
-        options: frame, ranking and budget.
+        number: of the frame in the drive, from 0.
+        options: ranking and budget of each frame up to and including this one.
+
+    Raises:
+        ConfigError: the drive has no such frame.
     """
+    if number < 0:
+        raise ConfigError(f"frame is {number}, must be 0 or more")
     watching = _Watching(policy_named(options.ranking))
-    asked = RobotOptions(
-        options.ranking, options.lanes, options.rounds, relocaliser=options.relocaliser
-    )
     with (
-        open_map(map_path, options.at) as opened,
-        robot_on(opened, sequence, settings, asked, watching) as robot,
+        robot_on(opened, sequence, settings, options, watching) as robot,
         closing(arriving(sequence)) as frames,
     ):
-        for number, arrived in enumerate(frames):
-            watching.watches = number == options.frame
+        for at, arrived in enumerate(frames):
+            watching.watches = at == number
             result = robot.step(arrived)
-            if number == options.frame:
+            if at == number:
                 assert robot.last is not None
-                found = _explained(opened, options, result, watching, robot.last)
-                return replace(found, refused=robot.last.refused)
-    raise ConfigError(f"the drive has no frame {options.frame}; it has {len(sequence)}")
+                found = Explanation(
+                    number,
+                    result.stamp_ns,
+                    options.ranking,
+                    result.status,
+                    refused=robot.last.refused,
+                )
+                return _with_candidates(found, opened, watching, robot.last)
+    raise ConfigError(f"the drive has no frame {number}; it has {len(sequence)}")
 
 
-def _explained(
-    opened: Map,
-    options: ExplainOptions,
-    result: Localisation,
-    watching: _Watching,
-    last: LastFrame,
+def _with_candidates(
+    found: Explanation, opened: Map, watching: _Watching, last: LastFrame
 ) -> Explanation:
     if watching.asked is None:
-        return Explanation(options.frame, result.stamp_ns, options.ranking, result.status)
+        return found
     context, order, reasons, foreseen = watching.asked
     attempted = {outcome.candidate.index for outcome in last.outcomes}
     near, rates = context.neighbourhood, context.success_rates()
@@ -222,15 +200,7 @@ def _explained(
                 inliers=int(foreseen.inliers[row]),
             )
         )
-    return Explanation(
-        options.frame,
-        result.stamp_ns,
-        options.ranking,
-        result.status,
-        reasons.meaning,
-        reasons.rule,
-        tuple(candidates),
-    )
+    return replace(found, meaning=reasons.meaning, rule=reasons.rule, candidates=tuple(candidates))
 
 
 def _drives(opened: Map) -> dict[SessionId, str]:
