@@ -85,7 +85,7 @@ def test_edges_wait_for_more_than_a_first_match_shows() -> None:
     assert not after(*[replace(USUAL, unevenness=2.8)] * 4).proved
 
 
-def test_a_robot_that_measured_its_way_into_the_map_proves_itself_only_after_a_doubt() -> None:
+def test_a_robot_that_measured_its_path_from_the_map_proves_itself_only_after_a_doubt() -> None:
     run = Run(LookalikeConfig())
     run.begin(measured=True)
     assert after(USUAL, run=run).proved

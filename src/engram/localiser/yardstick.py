@@ -302,7 +302,7 @@ class Run:
         """The next match is of another run.
 
         Args:
-            measured: whether the robot measured its way into the map before: until its matches
+            measured: whether the robot measured its path from the map: until its matches
                 are doubted, they create edges without another proof.
         """
         self._alike, self._at_m, self.believed, self.proved = 0.0, None, True, True
