@@ -121,12 +121,34 @@ def _team() -> Iterator[list[_Running]]:
             worker.process.join()
 
 
+# Read once, when a process loads NumPy or SciPy.
+_BLAS_THREADS = "OPENBLAS_NUM_THREADS"
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Processes started in the block use one thread of BLAS, unless the environment says how many.
+
+    Our matrices are too small for more, and idle threads of BLAS spin on the cores that other
+    workers need.
+    """
+    if _BLAS_THREADS in os.environ:
+        yield
+        return
+    os.environ[_BLAS_THREADS] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[_BLAS_THREADS]
+
+
 def _start(work: Callable[[Task, Monitor], Result], name: str, task: Task) -> _Running:
     # Spawned: a forked child would inherit the locks of the parent's threads.
     context = multiprocessing.get_context("spawn")
     pipe, theirs = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(work, task, theirs), daemon=True)
-    process.start()
+    with one_blas_thread():
+        process.start()
     theirs.close()
     return _Running(name, process, pipe)
 

@@ -29,7 +29,7 @@ from engram.localiser.relocalisation import check_relocaliser
 from engram.localiser.settings import METHOD_VERSION
 from engram.measures import Drive, Estimator, failure_sums
 from engram.monitor import Monitor, write_whole
-from engram.processes import end_with_parent
+from engram.processes import end_with_parent, one_blas_thread
 from engram.robot.settings import Settings
 from engram_lab.charts import Line
 from engram_lab.intervals import (
@@ -342,7 +342,7 @@ def _executor(workers: int) -> Iterator[Executor]:
         return
     # Started afresh: a forked child would share the parent's threads half way through.
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _begin_worker) as pool:
+    with one_blas_thread(), ProcessPoolExecutor(workers, context, _begin_worker) as pool:
         yield pool
 
 
