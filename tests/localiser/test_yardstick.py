@@ -85,15 +85,18 @@ def test_edges_wait_for_more_than_a_first_match_shows() -> None:
     assert not after(*[replace(USUAL, unevenness=2.8)] * 4).proved
 
 
-def test_a_robot_that_measured_its_path_from_the_map_proves_itself_only_after_a_doubt() -> None:
+def test_a_robot_that_measured_its_path_from_the_map_needs_no_other_proof() -> None:
     run = Run(LookalikeConfig())
-    run.begin(measured=True)
-    assert after(USUAL, run=run).proved
-    assert not after(*[LOOKALIKE] * 20, USUAL, run=run, at_m=2.0).proved
-    run.begin(measured=True)
+    run.measured()
+    assert after(LOOKALIKE, run=run).believed
+    assert run.proved
+    # Matches that show too little are doubted all the same, however often it measures again.
+    assert not after(*[LOOKALIKE] * 20, run=run, at_m=2.0).believed
+    run.measured()
+    assert not after(USUAL, run=run, at_m=44.0).believed
     # After 31 m without a match it is a run like any other.
-    after(USUAL, run=run)
-    assert not after(USUAL, run=run, at_m=31.0).proved
+    assert after(USUAL, run=run, at_m=75.1).believed
+    assert not run.proved
 
 
 def test_a_run_that_has_shown_enough_is_judged_no_more_until_it_breaks() -> None:

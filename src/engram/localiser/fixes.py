@@ -491,7 +491,10 @@ class Fixes:
         self._told = not agreed
         self._record.forget(agreed)
         self._chain.settle()
-        self._run.begin(measured=agreed > 0)
+        if agreed:
+            self._run.measured()
+        else:
+            self._run.begin()
 
     def settled(self) -> None:
         """The live frame was saved as a node, which is the position from now on."""

@@ -296,17 +296,17 @@ class Run:
         self._alike = 0.0
         self._at_m: float | None = None
         self.believed = self.proved = True
-        self._measured = False
+        self._new = True
 
-    def begin(self, *, measured: bool = False) -> None:
-        """The next match is of another run.
-
-        Args:
-            measured: whether the robot measured its path from the map: until its matches
-                are doubted, they create edges without another proof.
-        """
+    def begin(self) -> None:
+        """The next match is of another run."""
         self._alike, self._at_m, self.believed, self.proved = 0.0, None, True, True
-        self._measured = measured
+        self._new = True
+
+    def measured(self) -> None:
+        """The position was measured from nodes of the map before: a new run has proved itself."""
+        if self._new:
+            self._alike, self._new = -self._config.edges, False
 
     def due(self, driven_m: float) -> bool:
         """Whether a match after so many metres says more than those before."""
@@ -323,16 +323,16 @@ class Run:
 
     def add(self, alike: float, driven_m: float) -> None:
         """Adds a match, by its log-odds of being a look-alike, after so many metres."""
-        config, first = self._config, self._at_m is None
+        config, first = self._config, self._new
         step_m = config.apart_m if self._at_m is None else driven_m - self._at_m
         total = self._alike + min(step_m / config.apart_m, 1.0) * alike
         self._alike = min(max(total, -config.most), config.most)
-        self._at_m = driven_m
+        self._at_m, self._new = driven_m, False
         if self.believed:
             self.believed = self._alike <= (config.doubt_first if first else config.doubt)
         else:
             self.believed = self._alike <= -config.proof
-        shown = self._alike <= -config.edges or (self.proved and (self._measured or not first))
+        shown = self._alike <= -config.edges or (self.proved and not first)
         self.proved = self.believed and shown
 
 
