@@ -21,9 +21,10 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +40,12 @@ from engram.maps.map import open_map
 from engram_lab.programs import Figure, command_line, report
 from engram_lab.synthetic_places import SESSION_NODES, write_map, write_session
 
-_MAP = "fleet"
+MAP = "fleet"
 _FORAY_NODES = 20
 _NEW_NODES = 50
 _ASK_S = 0.05
 _PROGRAM = "import sys; from engram.cli import main; sys.argv[0] = 'engram'; main()"
-_MISSION = {"select": "budget", "budget_percent": 25.0}
+_MISSION: Mapping[str, Any] = {"select": "budget", "budget_percent": 25.0}
 
 
 def made_centre(folder: Path, nodes: int) -> Centre:
@@ -52,14 +53,27 @@ def made_centre(folder: Path, nodes: int) -> Centre:
     centre = Centre(folder)
     if nodes:
         places = [range(at, at + SESSION_NODES) for at in range(0, nodes, SESSION_NODES)]
-        write_map(folder / "maps" / f"{_MAP}.engram", "fleet", places)
-    centre.add_map(_MAP, "lab", MapPolicy(merge=MergeOptions(relocaliser="none")))
+        write_map(folder / "maps" / f"{MAP}.engram", "fleet", places)
+    centre.add_map(MAP, "lab", MapPolicy(merge=MergeOptions(relocaliser="none")))
     return centre
 
 
+@dataclass(frozen=True, slots=True)
+class Service:
+    """A running centre.
+
+    Attributes:
+        url: its address.
+        pid: of its process, whose child is the worker.
+    """
+
+    url: str
+    pid: int
+
+
 @contextmanager
-def served(folder: Path) -> Iterator[str]:
-    """The address of a running centre."""
+def served(folder: Path) -> Iterator[Service]:
+    """Runs a centre with its worker for the length of the block."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -68,7 +82,7 @@ def served(folder: Path) -> Iterator[str]:
         try:
             assert service.stdout is not None
             service.stdout.readline()  # it tells its address as soon as it answers
-            yield f"http://127.0.0.1:{port}"
+            yield Service(f"http://127.0.0.1:{port}", service.pid)
         finally:
             service.terminate()
 
@@ -164,23 +178,28 @@ def seen(times_s: list[float]) -> list[Figure]:
 def used_below(pid: int) -> tuple[float, float]:
     """What the processes that one started take: time of a core, s, and greatest memory, bytes."""
     time_s = memory = 0.0
-    for children in Path(f"/proc/{pid}").glob("task/*/children"):
-        for child in children.read_text().split():
-            folder = Path("/proc") / child
-            fields = (folder / "stat").read_text().rsplit(")", 1)[1].split()
-            peak = re.search(r"VmHWM:\s+(\d+) kB", (folder / "status").read_text())
-            below_s, below = used_below(int(child))
-            time_s += sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK") + below_s
-            memory += (1024.0 * int(peak.group(1)) if peak else 0.0) + below
+    for child in children_of(pid):
+        folder = Path("/proc") / str(child)
+        fields = (folder / "stat").read_text().rsplit(")", 1)[1].split()
+        peak = re.search(r"VmHWM:\s+(\d+) kB", (folder / "status").read_text())
+        below_s, below = used_below(child)
+        time_s += sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK") + below_s
+        memory += (1024.0 * int(peak.group(1)) if peak else 0.0) + below
     return time_s, memory
 
 
-def first_byte_s(folder: Path) -> float:
+def children_of(pid: int) -> list[int]:
+    """The processes that one started."""
+    told = (one.read_text() for one in Path(f"/proc/{pid}").glob("task/*/children"))
+    return [int(child) for children in told for child in children.split()]
+
+
+def first_byte_s(folder: Path, options: Mapping[str, Any] = _MISSION) -> float:
     """From asking for a mission's download to its first byte, as one robot."""
     with Agent(folder) as agent:
         started = time.perf_counter()
-        body = {"ref": "head", "options": _MISSION}
-        asked = agent.link.ask("POST", f"/v1/maps/{_MAP}/downloads", body)
+        body = {"ref": "head", "options": options}
+        asked = agent.link.ask("POST", f"/v1/maps/{MAP}/downloads", body)
         while asked["state"] == "asked":
             time.sleep(_ASK_S)
             asked = agent.link.ask("GET", f"/v1/artifacts/{asked['id']}")
@@ -218,8 +237,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         with made_centre(folder / "centre", asked.nodes) as centre:
-            codes = [new_code(centre, _MAP, "head", "lab") for _ in range(asked.agents)]
-        with served(folder / "centre") as url:
+            codes = [new_code(centre, MAP, "head", "lab") for _ in range(asked.agents)]
+        with served(folder / "centre") as service:
+            url = service.url
             day = Day(folder, url, asked.minutes, asked.forays)
             with ThreadPoolExecutor(asked.agents) as robots:
                 list(robots.map(day.live, range(asked.agents), codes))

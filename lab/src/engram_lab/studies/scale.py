@@ -70,6 +70,7 @@ from engram.maps.rows import (
 )
 from engram.maps.sqlite import SqliteDatabase
 from engram.maps.upgrading import complete_history
+from engram.maps.writer import RevisionWriter
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.places.vocabulary import Vocabulary, default_vocabulary, hash_of
 from engram.places.words import NodeWords
@@ -89,10 +90,11 @@ from engram_lab.synthetic_places import (
 LANES = 5
 LANDMARKS, FAR_LANDMARKS = 100, 12
 BEGIN = 20  # the metre of the driven street at which the robot begins
+LANE = 2  # along which drives are handed in
 STEPS = 200
 _TRIED = 46  # attempts of a drive per metre
 _PERIOD_NS = 100_000_000
-_FIRST_NS = 1_600_000_000_000_000_000
+FIRST_NS = 1_600_000_000_000_000_000
 _STEP_SIGMA = np.diag([0.01**2] * 3 + [0.002**2] * 3)
 _MATCH_SIGMA = np.diag([0.02**2] * 3 + [0.004**2] * 3)
 _STEP, _MATCH = covariance_bytes(_STEP_SIGMA), covariance_bytes(_MATCH_SIGMA)
@@ -105,10 +107,12 @@ class City:
     Attributes:
         streets: how many.
         length: of each, in metres.
+        distinct: so many streets on either side of the driven one have landmarks of their own.
     """
 
     streets: int
     length: int = 500
+    distinct: int = 1
 
     @staticmethod
     def of(nodes: int) -> City:
@@ -127,7 +131,7 @@ class City:
 
     def drive(self, street: int, lane: int) -> Session:
         """The drive along a lane of a street."""
-        start_ns = _FIRST_NS + (street * LANES + lane) * 3_600_000_000_000
+        start_ns = FIRST_NS + (street * LANES + lane) * 3_600_000_000_000
         made = drive_of("fleet", start_ns, f"{street}-{lane}")
         return replace(made, clock=Clock.UTC, longitude_deg=0.0)
 
@@ -144,7 +148,7 @@ class City:
         return SE3(turn, begin + turn @ np.array([0.5 * (lane - LANES // 2), 0.0, float(metre)]))
 
     def seed(self, street: int, metre: int) -> int:
-        """Draws the landmarks at a metre of a street near the driven one."""
+        """Draws the landmarks at a metre of a street that has its own."""
         return street * self.length + metre
 
     def frame(self, metre: int) -> LoggedFrame:
@@ -159,9 +163,17 @@ class City:
         drawn = np.random.default_rng(place)
         blob = landmark_bytes(drawn, np.random.default_rng((metre, 7)), LANDMARKS)
         landmarks = decode_landmarks(blob, CAMERA, DESCRIPTOR)
-        stamp_ns = 2 * _FIRST_NS + metre * _PERIOD_NS
+        stamp_ns = 2 * FIRST_NS + metre * _PERIOD_NS
         frame = Frame(stamp_ns, CAMERA, landmarks, DESCRIPTOR, FRONTEND, FrameStatus.OK)
         return LoggedFrame(frame, _AHEAD if metre > BEGIN else OdometryStep(OdometryStatus.FIRST))
+
+    def keep(self, path: Path) -> None:
+        """Writes its map unless it is there already."""
+        if not path.exists():
+            draft = path.with_suffix(".draft.engram")
+            draft.unlink(missing_ok=True)
+            self.write(draft)
+            draft.rename(path)
 
     def write(self, path: Path) -> None:
         """Writes its map."""
@@ -232,8 +244,8 @@ class _Rows:
             tool_version=__version__,
             configuration="{}",
             contents=to_json(contents),
-            opened_ns=_FIRST_NS + 2 * street,
-            committed_ns=_FIRST_NS + 2 * street + 1,
+            opened_ns=FIRST_NS + 2 * street,
+            committed_ns=FIRST_NS + 2 * street + 1,
             host="",
             pid=1,
             writer="",
@@ -284,7 +296,7 @@ class _Rows:
     def _node(self, revision: int, session: int, street: int, lane: int, metre: int) -> int:
         city = self._city
         made, key = city.node(street, lane, metre), self._next(schema.nodes)
-        near = abs(street - city.driven) <= 1
+        near = abs(street - city.driven) <= city.distinct
         blob, digest, words = _place(city.seed(street, metre) if near else -(metre % 64) - 1)
         self._put(
             schema.nodes,
@@ -474,7 +486,7 @@ def write_in(path: Path, city: City) -> dict[str, float]:
 
 def _write_drive(opened: Map, city: City, number: int, count: int) -> list[float]:
     """A drive past the nodes of a lane; seconds that its begin, checkpoint and commit take."""
-    made = drive_of("late", 2 * _FIRST_NS + number * 3_600_000_000_000, str(number))
+    made = drive_of("late", 2 * FIRST_NS + number * 3_600_000_000_000, str(number))
     nodes = [node_of(made, made.start_ns + at * _PERIOD_NS, float(at)) for at in range(count)]
     blob = landmark_bytes(np.random.default_rng(number), None, LANDMARKS)
     marks = [time.process_time()]
@@ -544,7 +556,7 @@ def _seconds(questions: Mapping[str, Callable[[], object]]) -> dict[str, float]:
 def merge_in(path: Path, city: City) -> dict[str, float]:
     """Merges drives into a copy of the map: half of their nodes are its own.
 
-    Of the others every second ten metres look as the driven street does, the rest as nowhere.
+    The others are those of `write_drive`.
     """
     found: dict[str, float] = {}
     with TemporaryDirectory(dir=path.parent) as folder:
@@ -584,8 +596,8 @@ def _timed_replay() -> Iterator[list[float]]:
 def _hand_in(source: Path, target: Path, city: City, count: int) -> None:
     """A robot's map of so many nodes, half of them of the city."""
     places = range(BEGIN, BEGIN + min(count // 2, city.length - BEGIN))
-    known = [city.node(city.driven, 2, metre) for metre in places]
-    made = drive_of("robot", 3 * _FIRST_NS, str(count))
+    known = [city.node(city.driven, LANE, metre) for metre in places]
+    made = drive_of("robot", 3 * FIRST_NS, str(count))
     with (
         Map.open(source) as fleet,
         Map.create(target) as own,
@@ -595,28 +607,40 @@ def _hand_in(source: Path, target: Path, city: City, count: int) -> None:
             writer.add_session(session, CAMERA, descriptor=DESCRIPTOR, frontend=FRONTEND)
         for one in fleet.frames.stored(known):
             writer.copy_node(one)
-        at_start = Edge(
-            known[0].id, _late(made, 0).id, EdgeKind.MATCH, SE3.identity(), _MATCH_SIGMA
-        )
-        step = SE3(np.eye(3), np.array([0.0, 0.0, 1.0]))
-        for at, metre in enumerate(places):
-            seed = city.seed(city.driven, metre) if (at // 10) % 2 == 0 else 10**6 + at
-            look = np.random.default_rng((at, 7))
-            blob = landmark_bytes(np.random.default_rng((seed, 0)), look, LANDMARKS)
-            node = _late(made, at)
-            writer.copy_node(stored(node, blob))
-            before = _late(made, at - 1).id
-            writer.add_edge(
-                Edge(before, node.id, EdgeKind.ODOMETRY, step, _STEP_SIGMA) if at else at_start
-            )
-            writer.add_path_entry(
-                PathEntry(path_id(made.id), at, node.id, PathEntryKind.SAVED, node.stamp_ns)
-            )
+        write_drive(writer, city, made, city.driven, places)
         writer.commit()
 
 
-def _late(made: Session, at: int) -> Node:
-    return node_of(made, made.start_ns + at * _PERIOD_NS, float(at))
+def write_drive(
+    writer: RevisionWriter, city: City, made: Session, street: int, places: range
+) -> None:
+    """Saves a drive along a lane of a street, tied to the lane at the first metre.
+
+    Every second ten metres look as the street does, the rest as nowhere else.
+
+    Args:
+        writer: of a map that holds that node of the lane, and the session.
+        city: where it drives.
+        made: the drive's session.
+        street: one that has landmarks of its own.
+        places: metres of the street.
+    """
+    known = city.node(street, LANE, places[0])
+    step, before = SE3(np.eye(3), np.array([0.0, 0.0, 1.0])), known
+    for at, metre in enumerate(places):
+        seed = city.seed(street, metre) + (0 if (at // 10) % 2 == 0 else 10**6)
+        look = np.random.default_rng((at, 7))
+        blob = landmark_bytes(np.random.default_rng((seed, 0)), look, LANDMARKS)
+        node = node_of(made, made.start_ns + at * _PERIOD_NS, float(at))
+        writer.copy_node(stored(node, blob))
+        writer.add_edge(
+            Edge(before.id, node.id, EdgeKind.ODOMETRY, step, _STEP_SIGMA)
+            if at
+            else Edge(known.id, node.id, EdgeKind.MATCH, SE3.identity(), _MATCH_SIGMA)
+        )
+        entry = PathEntry(path_id(made.id), at, node.id, PathEntryKind.SAVED, node.stamp_ns)
+        writer.add_path_entry(entry)
+        before = node
 
 
 def download_in(path: Path, city: City) -> dict[str, float]:
@@ -707,11 +731,7 @@ def measure(
     for size in sizes:
         city = City.of(size)
         path = folder / f"city-{city.nodes}.engram"
-        if not path.exists():
-            draft = path.with_suffix(".draft.engram")
-            draft.unlink(missing_ok=True)
-            city.write(draft)
-            draft.rename(path)
+        city.keep(path)
         values: dict[str, float] = {}
         for name in measures:
             values |= _in_a_child(name, path, city)
