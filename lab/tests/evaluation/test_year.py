@@ -43,7 +43,7 @@ def test_a_run_continues_where_another_stopped(year: Year, whole, tmp_path: Path
     assert resumed.rows("everything kept", None) == whole
 
 
-@pytest.mark.parametrize("arm", [name for name, order in ARMS.items() if order is not None])
+@pytest.mark.parametrize("arm", [name for name, one in ARMS.items() if one is not None])
 def test_a_map_that_forgets_holds_what_it_may(year: Year, whole, tmp_path: Path, arm: str) -> None:
     rows = Year(year.drives[:2], tmp_path, year.settings, OPTIONS).rows(arm, 6)
     assert [row["nodes"] for row in rows] == [6, 6]
@@ -52,9 +52,9 @@ def test_a_map_that_forgets_holds_what_it_may(year: Year, whole, tmp_path: Path,
 
 def test_the_oldest_go_first(year: Year, whole, tmp_path: Path) -> None:
     path = shutil.copy(year.folder / "everything-kept.engram", tmp_path / "m.engram")
-    order = ARMS["oldest forgotten"]
-    assert order is not None
-    assert forget_down_to(path, 5, order) == whole[-1]["nodes"] - 5
+    arm = ARMS["half forgotten, oldest"]
+    assert arm is not None
+    assert forget_down_to(path, 5, arm.kept_first) == whole[-1]["nodes"] - 5
     with Map.open(path) as left, Map.open(year.folder / "everything-kept.engram") as before:
         kept, all_of_them = (
             [one.stamp_ns for one in store.load().nodes] for store in (left, before)

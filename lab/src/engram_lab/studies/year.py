@@ -6,9 +6,9 @@
 The weekly drives of campaign `year` are mapped one after another, as a robot does it by default.
 [L15] §II says of its predecessor that the number of experiences tends to a constant, and against
 deleting that what is deleted may be needed again. So the same drives are mapped in maps that may
-hold a share of the nodes that the whole map comes to, and that forget after each drive what is
-beyond: what serves least (`engram forget --down-to`), the drives' oldest nodes, or any. A second
-run continues where the first one stopped.
+hold a share of the nodes that the whole map comes to, four fifths or half, and that forget after
+each drive what is beyond: what serves least (`engram forget --down-to`), the drives' oldest nodes,
+or any. A second run continues where the first one stopped.
 """
 
 from __future__ import annotations
@@ -35,8 +35,6 @@ from engram_lab.studies.drives import EvaluatedDrive, open_campaign
 from engram_lab.studies.plan import Row, table, write_csv
 from engram_lab.town.simulating import campaigns_folder
 
-# Share of the whole map's last number of nodes that a map which forgets may hold.
-SHARE = 0.5
 _FAR_M = 10.0
 # From this drive on growth is judged: three months.
 _SETTLED = 13
@@ -58,12 +56,26 @@ def most_serving_first(stock: Stock) -> list[NodeId]:
     return [stock.node_ids[at] for at in serving_order(stock).tolist()]
 
 
-# In what order a map's nodes are kept; none forgets nothing.
-ARMS: Mapping[str, Callable[[Stock], list[NodeId]] | None] = {
+@dataclass(frozen=True, slots=True)
+class Forgetting:
+    """How a map forgets.
+
+    Attributes:
+        kept_first: its nodes in the order in which they are kept.
+        share: of the whole map's last number of nodes, which it may hold.
+    """
+
+    kept_first: Callable[[Stock], list[NodeId]]
+    share: float = 0.5
+
+
+# None forgets nothing.
+ARMS: Mapping[str, Forgetting | None] = {
     "everything kept": None,
-    "least serving forgotten": most_serving_first,
-    "oldest forgotten": newest_first,
-    "random forgotten": random_order,
+    "a fifth forgotten, least serving": Forgetting(most_serving_first, 0.8),
+    "half forgotten, least serving": Forgetting(most_serving_first),
+    "half forgotten, oldest": Forgetting(newest_first),
+    "half forgotten, random": Forgetting(random_order),
 }
 
 
@@ -114,9 +126,9 @@ class Year:
             )
             if len(found) <= number:
                 raise SystemExit(f"{path} holds drives that are missing from {kept}; remove both")
-            kept_first = ARMS[arm]
-            if most is not None and kept_first is not None:
-                found[number]["forgotten"] = forget_down_to(path, most, kept_first)
+            forgetting = ARMS[arm]
+            if most is not None and forgetting is not None:
+                found[number]["forgotten"] = forget_down_to(path, most, forgetting.kept_first)
             with Map.open(path) as store:
                 one = built.sessions[number]
                 found[number] |= {
@@ -183,7 +195,7 @@ def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--campaign", default="year", help="NAME or NAME@SEED")
-    parser.add_argument("--arms", default=",".join(ARMS), help="some of them, by name")
+    parser.add_argument("--arm", dest="arms", action="append", help="one of them; repeatable")
     asked = parser.parse_args()
     settings = Settings().for_descriptor(None)
     drives = open_campaign(asked.campaign, campaigns_folder(), settings=settings).drives
@@ -191,15 +203,15 @@ def main() -> None:
     year = Year(drives, asked.out, settings, RobotOptions())
     first, *others = ARMS
     found = year.rows(first, None)
-    most = int(SHARE * found[-1]["nodes"])
+    whole = list(found)
     for arm in others:
-        if arm in asked.arms.split(","):
-            found += year.rows(arm, most)
+        forgetting = ARMS[arm]
+        if forgetting is not None and (asked.arms is None or arm in asked.arms):
+            found += year.rows(arm, int(forgetting.share * whole[-1]["nodes"]))
     write_csv(asked.out / "drives.csv", found)
-    whole = [row for row in found if row["arm"] == first]
     lines = [
         f"{len(whole)} drives of `{asked.campaign}`. Nodes grow by {growth_a_month(whole):.1f} % a "
-        f"month after the third month. Maps that forget hold {most} nodes at most.",
+        f"month after the third month.",
         "",
         *table(list(quarters(found))),
     ]
