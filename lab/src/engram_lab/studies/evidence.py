@@ -312,6 +312,13 @@ STUDIES: Mapping[str, Study] = {
         ("docs/evidence.md", "lab/reports/performance.md"),
         town=False,
     ),
+    "hand-ins": Study(
+        (f"{_CHECKS}hand_ins --json {{out}}/figures.json",),
+        15,
+        ("figures.json",),
+        ("docs/evidence.md",),
+        town=False,
+    ),
     "doctor": Study(
         (f"{_CHECKS}doctor --work {{out}}/trials.jsonl",),
         60,

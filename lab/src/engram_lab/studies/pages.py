@@ -137,6 +137,22 @@ def kills(tables: Path) -> Iterator[str]:
     yield "(`python -m engram_lab.checks.kill_mapping`)."
 
 
+def hand_ins(tables: Path) -> Iterator[str]:
+    """What an evening of hand-ins costs a centre."""
+    found = Figures(tables / "hand-ins/figures.json")
+    evening = "40 hand-ins of 300 nodes into 100000"
+    failed = int(found.value(evening, "hand-ins failed"))
+    ratio = found.value(evening, "a hand-in, seconds of a core: last by first medians")
+    yield (
+        "Of 40 drives of 300 nodes, handed in at once to 100,000 nodes, "
+        f"{failed or 'none'} failed. To merge them took"
+    )
+    yield (
+        f"{found.value(evening, 'of a core, merging'):.1f} min of a core, the last five "
+        f"{ratio:.2f} times as long as the first (`engram_lab.checks.hand_ins`)."
+    )
+
+
 # What a city costs, by the names that the study of its growth gives to parts of a row.
 _COSTS: Mapping[str, tuple[str, ...]] = {
     "open and first step at a known place, s": ("open and first step (s)",),
@@ -489,6 +505,7 @@ BLOCKS: Mapping[str, Block] = {
     "robot-needs": Block("robot-needs", robot_needs),
     "eyes": Block("eyes", eyes),
     "kills": Block("kills", kills),
+    "hand-ins": Block("hand-ins", hand_ins),
     "scale": Block("scale", scale),
     "scale-in-short": Block("scale", scale_in_short),
     "ranking": Block("ranking", ranking),
