@@ -153,7 +153,7 @@ class Saver:
                 ) from None
 
     def withdraw(self, stamp_ns: int) -> None:
-        """A later frame disproved the match: the attempts failed; visited is only a saved node."""
+        """A later frame disproved the match: attempts failed; no node but its own was visited."""
         for at, one in enumerate(self._held):
             if one.stamp_ns == stamp_ns:
                 failed = [replace(attempt, accepted=False) for attempt in one.attempts]
