@@ -171,6 +171,7 @@ def sampled(pid: int) -> Iterator[Usage]:
     finally:
         over.set()
         thread.join()
+        used.sample(pid)
 
 
 def evening(
@@ -210,7 +211,6 @@ def evening(
                 asked_s.append(first_byte_s(folder / "visitor", _elsewhere(city, at)))
             sent_ns = dict(sent)
             _wait(service.url, robots)
-            time.sleep(2 * _SAMPLED_S)
         served_figures = answers(service.url)
     with Centre(folder / "centre") as centre:
         rows = sorted(handins.listed(centre, MAP), key=lambda row: row.place or 0)

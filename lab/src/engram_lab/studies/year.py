@@ -211,7 +211,7 @@ def main() -> None:
     write_csv(asked.out / "drives.csv", found)
     lines = [
         f"{len(whole)} drives of `{asked.campaign}`. Nodes grow by {growth_a_month(whole):.1f} % a "
-        f"month after the third month.",
+        "month after the third month.",
         "",
         *table(list(quarters(found))),
     ]
