@@ -39,6 +39,7 @@ from engram.graph.model import (
     Session,
     path_id,
 )
+from engram.maps.forgetting import Chosen, erase_map
 from engram.maps.map import Map
 from engram.maps.map_files import copy_map
 from engram.maps.writer import RevisionWriter
@@ -118,6 +119,11 @@ def _make_map(path: Path) -> None:
         store.revert(2, author="lab", message="loose camera")
         store.tag("good", 1, author="lab", message="it works")
         store.tag("best", author="lab")
+        gone = drive_of("r6", 8_000_000_000)
+        _drive(store, gone)
+        chosen = Chosen(frozenset({gone.id}))
+        store.forget_nodes(chosen, author="lab", message="expired", configuration={})
+    erase_map(path)
 
 
 def _make_logged(town: Path, path: Path) -> None:

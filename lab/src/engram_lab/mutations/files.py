@@ -245,7 +245,8 @@ def many_rows(samples: Samples, folder: Path, chance: random.Random) -> Case:
     count = chance.choice([2, 100, 20_000])
     with closing(sqlite3.connect(path)) as connection, connection:
         row = _any_row(connection, table, chance)
-        for key in range(10_000, 10_000 + count):
+        keys = range(10_000, 10_000 + count) if row else ()
+        for key in keys:
             copy = {**row, "key": key}
             if "uuid" in copy:
                 copy["uuid"] = chance.randbytes(16)
