@@ -47,6 +47,14 @@ def faults(path) -> list[str]:
     return [str(one) for one in check_file(path).problems]
 
 
+def rows(path) -> int:
+    """Of the map with its log, read from copies of both."""
+    copy = path.with_name("copy.engram")
+    for suffix in ("", "-wal"):
+        shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
+    return check_file(copy).rows
+
+
 def test_a_sound_log_is_sound(logged):
     assert faults(logged) == []
     with Map.open(logged) as store:
@@ -66,6 +74,21 @@ def test_a_damaged_frame_is_found_and_named(logged, frame, at):
     fact = faults(logged)[0]  # checking folds the rest of the log into the file
     assert f"frame {frame} " in fact
     assert "lost" in fact
+
+
+@pytest.mark.parametrize("at", [0, 8, 16, 24, 4000])
+def test_a_last_commit_in_parts_is_noted(logged, at):
+    """A power cut leaves it so: some of its pages were written, and none was synced."""
+    log = logged.with_name("town.engram-wal")
+    frames = (len(log.read_bytes()) - _HEADER) // _FRAME
+    before = rows(logged)
+    change(logged, _HEADER + (frames - 1) * _FRAME + at, b"\xfe\xdc\xba\x98")
+    report = check_file(logged)
+    assert report.sound
+    (note,) = report.notes
+    assert note.startswith(f"town.engram-wal: its last commit is not whole from frame {frames} on")
+    assert report.rows < before
+    assert check_file(logged).notes == ()  # the check folded the rest of the log into the file
 
 
 def test_a_log_that_ends_early_is_an_earlier_state(logged):

@@ -211,6 +211,7 @@ def _checked_text(report: dict[str, Any], sealed: list[dict[str, Any]] | None) -
     ]
     lines += ["no session was interrupted"] if sealed == [] else []
     lines += [f"{one['table']} {one['record']}: {one['fact']}" for one in report["problems"]]
+    lines += report["notes"]
     lines += [
         f"session {session} was interrupted: map its drive again to resume it, or commit "
         "what it saved with --seal"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from uuid import UUID
@@ -184,19 +185,25 @@ class Lookups:
         Returns:
             `session` is a place in `some`, `reference` and `node` are keys of nodes.
         """
-        parts = []
+        made = dict.fromkeys(some, Attempts.none())
         with self._database.reading() as connection:
-            hidden = list(connection.execute(self._view.hidden_keys(nodes)).scalars())
-            for place, session in enumerate(some):
-                key = select(sessions.c.key).where(sessions.c.uuid == session.bytes)
-                query = self._view.select(attempts).where(
-                    attempts.c.session == key.scalar_subquery()
-                )
-                made = unpack_drive(list(verified(attempts, connection.execute(query))))
-                made = replace(made, session=np.full(len(made), place, np.int32))
-                unseen = np.isin(np.stack([made.reference, made.node]), hidden)
-                parts.append(made.rows(np.flatnonzero(~unseen.any(axis=0))))
-        return Attempts.joined(parts)
+            hidden = np.array(list(connection.execute(self._view.hidden_keys(nodes)).scalars()))
+            for part in few(some):
+                known = {one.bytes: one for one in part}
+                named = select(sessions.c.key, sessions.c.uuid).where(sessions.c.uuid.in_(known))
+                ids = {key: known[uuid] for key, uuid in connection.execute(named)}
+                query = self._view.select(attempts).where(attempts.c.session.in_(list(ids)))
+                rows = defaultdict[int, list[Row]](list)
+                for row in verified(attempts, connection.execute(query.order_by(attempts.c.key))):
+                    rows[row["session"]].append(row)
+                made |= {ids[key]: unpack_drive(own) for key, own in rows.items()}
+        parts = [
+            replace(own, session=np.full(len(own), place, np.int32))
+            for place, own in enumerate(made.values())
+        ]
+        found = Attempts.joined(parts)
+        unseen = np.isin(np.stack([found.reference, found.node]), hidden)
+        return found.rows(np.flatnonzero(~unseen.any(axis=0)))
 
     def edges(self, some: Iterable[NodeId]) -> list[Edge]:
         """The edges at some nodes, each once; of those with one (a, b, kind) the newest."""

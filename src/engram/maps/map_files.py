@@ -3,7 +3,8 @@
 Damage in a write-ahead log, which SQLite takes for the log's end without a word. Frames of a log
 chain their checksums. SQLite reads up to the first that does not fit, so a damaged frame loses what
 was committed after it. A log that ends early is an earlier state of its map, and a writer that is
-killed may leave one unfinished frame; both are sound.
+killed may leave one unfinished frame; both are sound. A power cut may leave the last commit in
+parts; it had not finished, since a commit is synced before it returns and before the next begins.
 
 Source: SQLite, "WAL-mode File Format".
 """
@@ -12,8 +13,9 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -37,8 +39,21 @@ _MASK = 0xFFFFFFFF
 _GENERATIONS = 2**20
 
 
-def log_problems(path: Path) -> list[str]:
-    """Faults of the log of a database without a writer; empty if there is no log.
+@dataclass(frozen=True, slots=True)
+class LogDamage:
+    """What is wrong with a log.
+
+    Attributes:
+        fact: it, with the log's name.
+        lost: whether something that was committed is lost for certain.
+    """
+
+    fact: str
+    lost: bool
+
+
+def log_damage(path: Path) -> LogDamage | None:
+    """Damage in the log of a database without a writer; None if there is no log, or no damage.
 
     Args:
         path: the database. Neither it nor its log is opened by SQLite yet, which would fold the
@@ -49,34 +64,58 @@ def log_problems(path: Path) -> list[str]:
     """
     log = path.with_name(f"{path.name}-wal")
     if not log.exists():
-        return []
+        return None
     with os.fdopen(open_regular(log, InputError), "rb") as file:
-        fact = _problem(file)
-    return [] if fact is None else [f"{log.name}: {fact}; what was written after it is lost"]
+        found = _damage(file)
+    return None if found is None else replace(found, fact=f"{log.name}: {found.fact}")
 
 
-def _problem(file: BinaryIO) -> str | None:
+def _lost(fact: str) -> LogDamage:
+    return LogDamage(f"{fact}; what was written after it is lost", lost=True)
+
+
+def _damage(file: BinaryIO) -> LogDamage | None:
     header = file.read(_HEADER)
     if len(header) < _HEADER:
         return None  # empty, or its writer was killed before the first frame
     page = int.from_bytes(header[8:12], "big")
     order = _ORDERS.get(header[:4])
     if order is None or not 512 <= page <= 65_536 or page & (page - 1):
-        return "its header is damaged"
-    summed = _sum(header[:_SUMMED], (0, 0), order)
-    if summed != _stored(header, _SUMMED):
-        return "its header does not match its checksum"
+        return _lost("its header is damaged")
+    if _sum(header[:_SUMMED], (0, 0), order) != _stored(header, _SUMMED):
+        return _lost("its header does not match its checksum")
+    return _frame_damage(file, header, page, order)
+
+
+def _frame_damage(file: BinaryIO, header: bytes, page: int, order: str) -> LogDamage | None:
+    summed = _stored(header, _SUMMED)
     for number in itertools.count(1):
         head, content = file.read(_FRAME_HEAD), file.read(page)
         if len(content) < page:
             return None
-        if head[8:16] != header[_SALTS]:
-            older = _is_older(head, header) and not _goes_on(file, header, page)
-            return None if older else f"frame {number} is of another log"
-        summed = _sum(content, _sum(head[:8], summed, order), order)
-        if summed != _stored(head, 16):
-            return f"frame {number} does not match its checksum"
+        ours = head[8:16] == header[_SALTS]
+        if ours:
+            summed = _sum(content, _sum(head[:8], summed, order), order)
+            if summed == _stored(head, 16):
+                continue
+        rest = [head] if ours else []
+        rest += _further(file, header, page)
+        if not (ours or rest) and _is_older(head, header):
+            return None
+        if sum(map(_commits, rest)) <= 1:
+            return LogDamage(
+                f"its last commit is not whole from frame {number} on: if the power was cut, it "
+                "had not finished; otherwise it is lost",
+                lost=False,
+            )
+        fact = "does not match its checksum" if ours else "is of another log"
+        return _lost(f"frame {number} {fact}")
     raise AssertionError
+
+
+def _commits(head: bytes) -> bool:
+    """Whether a frame is the last one of a commit."""
+    return any(head[4:8])
 
 
 def _is_older(head: bytes, header: bytes) -> bool:
@@ -85,13 +124,12 @@ def _is_older(head: bytes, header: bytes) -> bool:
     return 1 <= (ours - its) & _MASK <= _GENERATIONS
 
 
-def _goes_on(file: BinaryIO, header: bytes, page: int) -> bool:
-    """Whether a frame of this log comes after one that is not."""
+def _further(file: BinaryIO, header: bytes, page: int) -> Iterator[bytes]:
+    """Heads of this log's frames from here on."""
     while len(head := file.read(_FRAME_HEAD)) == _FRAME_HEAD:
         if head[8:16] == header[_SALTS]:
-            return True
+            yield head
         file.seek(page, os.SEEK_CUR)
-    return False
 
 
 def _stored(body: bytes, at: int) -> tuple[int, int]:
@@ -159,14 +197,14 @@ def check_file(
         RevisionError: the map has no such revision.
     """
     path = map_path(location)
-    lost = _log_problems(path)
+    lost, notes = _log_facts(path)
     try:
         database = SqliteDatabase(path)
     except MapCorruptError as error:
-        return CheckReport((*lost, Problem("file", "", str(error))), 0, 0, (), 0)
+        return CheckReport((*lost, Problem("file", "", str(error))), 0, 0, (), 0, notes)
     with closing(database):
         found = check(database, thin=thin, since=_number(database, since))
-    return replace(found, problems=(*lost, *found.problems))
+    return replace(found, problems=(*lost, *found.problems), notes=notes)
 
 
 def _number(database: SqliteDatabase, named: int | str | None) -> int | None:
@@ -176,9 +214,10 @@ def _number(database: SqliteDatabase, named: int | str | None) -> int | None:
         return resolve(connection, named, database.name)
 
 
-def _log_problems(path: Path) -> list[Problem]:
-    """Faults of a log that is not being written to."""
+def _log_facts(path: Path) -> tuple[tuple[Problem, ...], tuple[str, ...]]:
+    """Problems and notes about a log that is not being written to."""
     path = path.resolve()
-    if current_holder(path) is not None:
-        return []
-    return [Problem("file", "", fact) for fact in log_problems(path)]
+    damage = None if current_holder(path) is not None else log_damage(path)
+    if damage is None:
+        return (), ()
+    return ((Problem("file", "", damage.fact),), ()) if damage.lost else ((), (damage.fact,))

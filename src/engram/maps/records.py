@@ -223,6 +223,7 @@ class CheckReport:
         interrupted: sessions to be resumed or sealed; not a problem.
         abandoned_rows: rows of abandoned revisions still in the file, until `Map.clean`; not
             a problem.
+        notes: what may be damage, or what a power cut leaves of a commit that had not finished.
     """
 
     problems: tuple[Problem, ...]
@@ -230,6 +231,7 @@ class CheckReport:
     blobs: int
     interrupted: tuple[SessionId, ...]
     abandoned_rows: int
+    notes: tuple[str, ...] = ()
 
     @property
     def sound(self) -> bool:

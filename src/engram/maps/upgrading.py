@@ -24,7 +24,7 @@ from engram.maps.attempts import COLUMNS, pack, unpack, unpack_drive
 from engram.maps.changes import Changes
 from engram.maps.content import EMPTY_HASH, Identities, chained
 from engram.maps.counting import count_on
-from engram.maps.map_files import log_problems
+from engram.maps.map_files import log_damage
 from engram.maps.rows import (
     Row,
     cell_of,
@@ -120,8 +120,9 @@ def upgrade_map(path: Path) -> Upgraded:
         if _version(file) == FORMAT_VERSION:
             size = path.stat().st_size
             return Upgraded(FORMAT_VERSION, FORMAT_VERSION, 0, 0, size, size)
-        for fact in log_problems(path):
-            raise MapCorruptError(f"{path}: {fact}; restore a copy")
+        damage = log_damage(path)
+        if damage is not None and damage.lost:
+            raise MapCorruptError(f"{path}: {damage.fact}; restore a copy")
         with _to_itself(file) as source, draft_folder(path) as folder:
             return _upgraded(source, path, folder / path.name)
     finally:

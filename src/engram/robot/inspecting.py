@@ -139,6 +139,7 @@ def check_map(path: Path, *, clean: bool = False, since: int | str | None = None
         "interrupted": [str(session) for session in report.interrupted],
         "abandoned_rows": report.abandoned_rows,
         "removed_rows": removed,
+        "notes": list(report.notes),
     }
 
 

@@ -6,7 +6,7 @@ import json
 import random
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -77,11 +77,11 @@ class Samples:
 def make_samples(folder: Path) -> Samples:
     """Makes them in a folder."""
     town, logged = folder / "town.engram", folder / "logged.engram"
-    _make_map(town)
+    for _ in map_steps(town):
+        pass
     _make_logged(town, logged)
     framelog, flight = folder / "drive.framelog", folder / "drive.flight"
-    with FrameLogWriter(framelog, _header()) as writer:
-        _record(writer)
+    record_log(framelog)
     with FlightWriter(flight, _header()) as record:
         record.add_report({"reason": "lost", "robot": "r1"}, frames=_NODES, images=_NODES)
         _record(record)
@@ -99,11 +99,13 @@ def frame_of(stamp_ns: int) -> Frame:
     return Frame(stamp_ns, CAMERA, landmarks, DESCRIPTOR, FRONTEND, FrameStatus.OK, picture)
 
 
-def _make_map(path: Path) -> None:
+def map_steps(path: Path) -> Iterator[str]:
+    """Makes a map with rows in almost every table, naming each step once it is done."""
     with Map.create(path) as store:
-        first = _drive(store, drive_of("r1", 1_000))
-        _drive(store, drive_of("r2", 2_000_000_000))
-        _drive(store, drive_of("r3", 4_000_000_000))
+        yield "create"
+        first = yield from drive_steps(store, drive_of("r1", 1_000))
+        yield from drive_steps(store, drive_of("r2", 2_000_000_000))
+        yield from drive_steps(store, drive_of("r3", 4_000_000_000))
         with store.begin_revision(author="lab", message="marks", configuration={"a": 1}) as writer:
             for mark in _marks(first):
                 writer.add_mark(mark)
@@ -111,19 +113,32 @@ def _make_map(path: Path) -> None:
             writer.add_omission(Omission(gone, first[0], SE3.identity(), bytes(range(16))))
             writer.put_statistic("speed", {"mean": 1.5})
             writer.commit()
+        yield "marks"
         words = encode_vocabulary(one_word_vocabulary(DESCRIPTOR))
         store.put_vocabulary(words, author="lab", message="words", configuration={})
         store.put_words(bytes(16), {node: np.array([3, 5, 700]) for node in first})
+        yield "words"
         session = next(iter(store.sessions))
         store.amend(session, {Amendable.ROBOT: "renamed"}, author="lab")
+        yield "amend"
         store.revert(2, author="lab", message="loose camera")
+        yield "revert"
         store.tag("good", 1, author="lab", message="it works")
         store.tag("best", author="lab")
-        gone = drive_of("r6", 8_000_000_000)
-        _drive(store, gone)
-        chosen = Chosen(frozenset({gone.id}))
+        yield "tag"
+        expired = drive_of("r6", 8_000_000_000)
+        yield from drive_steps(store, expired)
+        chosen = Chosen(frozenset({expired.id}))
         store.forget_nodes(chosen, author="lab", message="expired", configuration={})
+        yield "forget"
     erase_map(path)
+    yield "erase"
+
+
+def record_log(path: Path) -> None:
+    """Records a frame log of a few frames."""
+    with FrameLogWriter(path, _header()) as writer:
+        _record(writer)
 
 
 def _make_logged(town: Path, path: Path) -> None:
@@ -131,13 +146,15 @@ def _make_logged(town: Path, path: Path) -> None:
     draft = path.with_name("draft.engram")
     copy_map(town, draft)
     with Map.open(draft, writes=True) as store:
-        _drive(store, drive_of("r5", 6_000_000_000))
+        for _ in drive_steps(store, drive_of("r5", 6_000_000_000)):
+            pass
         store.tag("late", author="lab")
         for suffix in ("", "-wal"):  # before the last connection folds the log into the file
             shutil.copyfile(f"{draft}{suffix}", f"{path}{suffix}")
 
 
-def _drive(store: Map, drive: Session) -> list[NodeId]:
+def drive_steps(store: Map, drive: Session) -> Generator[str, None, list[NodeId]]:
+    """Adds a drive of a few nodes, with a checkpoint on its way."""
     writer = store.begin_session(
         drive,
         CAMERA,
@@ -153,7 +170,11 @@ def _drive(store: Map, drive: Session) -> list[NodeId]:
         writer.add_path_entry(entry)
         if at:
             _tie(writer, nodes[at - 1], node, at)
+        if at == 1:
+            writer.checkpoint()
+            yield "checkpoint"
     writer.commit()
+    yield "drive"
     return [node.id for node in nodes]
 
 

@@ -319,7 +319,8 @@ def _copy(path: Path, folder: str) -> Path:
 
 def _read_map(path: Path, folder: Path, merges: bool) -> bool:
     try:
-        sound = check_file(path).sound
+        report = check_file(path)
+        sound = report.sound and not report.notes
     except EngramError:
         sound = False
     with suppress(EngramError), Map.open(path) as store:
