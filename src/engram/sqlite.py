@@ -12,7 +12,7 @@ import re
 import sqlite3
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -219,16 +219,24 @@ class SqliteFile:
             isolation_level=None,
         )
         try:
-            connection.execute("PRAGMA trusted_schema=OFF")  # call no functions of the file
-            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
-            connection.setlimit(sqlite3.SQLITE_LIMIT_EXPR_DEPTH, 100)
-            connection.execute("PRAGMA cell_size_check=ON")
-            connection.execute("PRAGMA synchronous=FULL")
-            connection.execute(f"PRAGMA cache_size=-{_CACHE_KIB}")
-        except sqlite3.Error:
+            _prepare(connection)
+        except sqlite3.Error as error:
             connection.close()
-            raise
+            if error.sqlite_errorcode != sqlite3.SQLITE_READONLY_ROLLBACK or not self._roll_back():
+                raise
+            return self.connect(options)
         return connection
+
+    def _roll_back(self) -> bool:
+        """Undoes what a killed process or a power cut left of a transaction beside the file.
+
+        Readers cannot: they have it open for reading only. False if nobody may write here.
+        """
+        if not (os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK)):
+            return False
+        with closing(self.connect("mode=rw")) as connection:
+            connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
+        return True
 
     def engine(
         self, options: str, prepare: Callable[[sqlite3.Connection], object] | None = None
@@ -286,6 +294,11 @@ class SqliteFile:
         elif primary == sqlite3.SQLITE_NOTADB:
             error = self.kind.strange
             fact = f"is not a {noun}: it is not an SQLite file, or its beginning is damaged"
+        elif code == sqlite3.SQLITE_READONLY_ROLLBACK:
+            fact = (
+                f"holds an interrupted transaction, which {self.path.name}-journal undoes: copy "
+                "both to a writable folder"
+            )
         elif primary == sqlite3.SQLITE_CANTOPEN:
             error = self.kind.strange
             fact = (
@@ -327,3 +340,12 @@ class _FileDialect(SQLiteDialect_pysqlite):
 
 registry.register("engramfile", __name__, _FileDialect.__name__)
 _COMPILED: LRUCache[Any, Any] = LRUCache(500)
+
+
+def _prepare(connection: sqlite3.Connection) -> None:
+    connection.execute("PRAGMA trusted_schema=OFF")  # call no functions of the file
+    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_VALUE)
+    connection.setlimit(sqlite3.SQLITE_LIMIT_EXPR_DEPTH, 100)
+    connection.execute("PRAGMA cell_size_check=ON")
+    connection.execute("PRAGMA synchronous=FULL")
+    connection.execute(f"PRAGMA cache_size=-{_CACHE_KIB}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -37,6 +39,21 @@ def stamp_ns(index: int) -> int:
 
 def camera() -> StereoCamera:
     return StereoCamera(40.0, 40.0, 23.5, 15.5, 0.1, WIDTH, HEIGHT)
+
+
+def interrupt_transaction(path: Path, delete_from: str, target: Path) -> None:
+    """Copies an SQLite file as a process killed within a deletion leaves it, with its journal."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        connection.execute("PRAGMA cache_spill = 1")
+        connection.execute("PRAGMA cache_size = 1")
+        connection.execute("PRAGMA secure_delete = ON")
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute(f"DELETE FROM {delete_from}")
+        target.parent.mkdir(exist_ok=True)
+        for end in ("", "-journal"):
+            content = path.with_name(path.name + end).read_bytes()
+            target.with_name(target.name + end).write_bytes(content)
+        connection.execute("ROLLBACK")
 
 
 def write_image(path: Path, image: np.ndarray) -> None:

@@ -33,7 +33,16 @@ from .bag_maker import (
     made,
     rectified_infos,
 )
-from .synthetic import HEIGHT, PAIRS, START_NS, WIDTH, camera, picture, stamp_ns
+from .synthetic import (
+    HEIGHT,
+    PAIRS,
+    START_NS,
+    WIDTH,
+    camera,
+    interrupt_transaction,
+    picture,
+    stamp_ns,
+)
 
 PICTURES = [(stamp_ns(index), picture(index, 0), picture(index, 1)) for index in range(PAIRS)]
 CAMERA = camera()
@@ -406,6 +415,14 @@ class TestContainers:
         monkeypatch.setattr(containers, "_connected", read_only)
         assert_whole(open_drive(path))
         assert sorted(one.name for one in path.iterdir()) == ["drive_0.db3", "drive_0.db3-wal"]
+
+    def test_a_recorder_killed_within_a_transaction(self, tmp_path) -> None:
+        source = bare_file(WHOLE.write(tmp_path / "whole", "sqlite"), "sqlite")
+        path = tmp_path / "killed" / "drive_0.db3"
+        interrupt_transaction(source, "messages", path)
+        assert path.read_bytes() != source.read_bytes()
+        assert_whole(open_drive(path.parent))
+        assert len(list(path.parent.iterdir())) == 2  # the recording itself is left alone
 
     def test_what_a_killed_recorder_of_ros_1_leaves(self, tmp_path) -> None:
         path = WHOLE.write(tmp_path / "b", "ros1").rename(tmp_path / "b.bag.active")

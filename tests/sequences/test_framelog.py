@@ -20,6 +20,7 @@ from engram.errors import (
     IncompatibleError,
     InputError,
     MapCorruptError,
+    MapError,
     MapLockedError,
     SequenceError,
     StorageFullError,
@@ -38,6 +39,7 @@ from .synthetic import (
     PAIRS,
     PERIOD_NS,
     START_NS,
+    interrupt_transaction,
     log_header,
     logged,
     only_engram_errors,
@@ -275,6 +277,26 @@ def test_a_killed_recording_keeps_its_checkpoints(tmp_path: Path) -> None:
     assert not log.complete
     with FrameLogWriter(path, log_header()) as writer:
         assert writer.recorded == 4
+
+
+def test_an_interrupted_transaction_is_undone(tmp_path: Path) -> None:
+    """A recorder that ends folds its log in; a kill or a power cut then leaves a journal."""
+    path = tmp_path / "cut" / "a.framelog"
+    whole = write_log(tmp_path / "a.framelog", [logged(index) for index in range(40)])
+    interrupt_transaction(whole, "frames", path)
+    assert path.read_bytes() != whole.read_bytes()
+    assert len(list(FrameLog(path))) == 40
+    assert [one.name for one in path.parent.iterdir()] == [path.name]
+
+
+def test_nobody_can_undo_a_transaction_on_read_only_media(tmp_path: Path, monkeypatch) -> None:
+    path = tmp_path / "cut" / "a.framelog"
+    interrupt_transaction(
+        write_log(tmp_path / "a.framelog", [logged(index) for index in range(40)]), "frames", path
+    )
+    monkeypatch.setattr(os, "access", lambda _, mode: mode != os.W_OK)  # root writes anywhere
+    with pytest.raises(MapError, match=r"a\.framelog-journal undoes: copy both"):
+        FrameLog(path)
 
 
 def test_a_log_is_read_while_it_is_written(tmp_path: Path) -> None:

@@ -360,7 +360,9 @@ def _log(path: Path) -> Path:
 
 
 def _has_log(path: Path) -> bool:
-    return _log(path).exists() and _log(path).stat().st_size > 0
+    """Whether a log lies beside a file, or what undoes an interrupted transaction."""
+    beside = _log(path), path.with_name(f"{path.name}-journal")
+    return any(one.exists() and one.stat().st_size > 0 for one in beside)
 
 
 def _state(path: Path) -> tuple[int, int, int] | None:

@@ -652,8 +652,11 @@ class DatabaseBag:
             if file.read(len(_SQLITE_MAGIC)) != _SQLITE_MAGIC:
                 raise DamageError(f"{self.path}: is not an SQLite file")
         try:
-            if not _has_log(self.path):
+            logs = _logs_of(self.path)
+            if not logs:
                 return _connected(self.path, "mode=ro&immutable=1")
+            if any(log.name.endswith(_UNDOES) for log in logs):
+                return _connected(self._copied(), "mode=rw")
             # What a killed recorder did not move into the file lies beside it. SQLite reads both
             # only where it can write an index beside them: not on a disk that is read-only.
             database = _connected(self._copied() if self._copy else self.path, "mode=ro")
@@ -667,23 +670,24 @@ class DatabaseBag:
         return database
 
     def _copied(self) -> Path:
-        """A copy of the file and its log in a folder that can be written to; made once."""
+        """A copy of the file and its logs in a folder that can be written to; made once."""
         if self._copy is not None:
             return Path(self._copy.name) / self.path.name
-        log = _log_of(self.path)
+        logs = _logs_of(self.path)
         try:
             folder = TemporaryDirectory(prefix="engram-bag-")
-            copy = Path(folder.name) / self.path.name
-            for source, target in ((self.path, copy), (log, _log_of(copy))):
+            for source in (self.path, *logs):
+                target = Path(folder.name) / source.name
                 with os.fdopen(open_regular(source), "rb") as read, target.open("xb") as written:
                     shutil.copyfileobj(read, written)
         except OSError as error:
+            named = " and ".join(log.name for log in logs)
             raise DamageError(
-                f"{self.path}: its last messages lie in {log.name}, and there is no room for a "
-                f"copy of both: {error.strerror}; copy them to a folder that can be written to"
+                f"{self.path}: its last messages depend on {named}, and there is no room for a "
+                f"copy of them: {error.strerror}; copy them to a folder that can be written to"
             ) from error
         self._copy = folder
-        return copy
+        return Path(folder.name) / self.path.name
 
     def _named(self, database: sqlite3.Connection) -> dict[int, Topic]:
         tables = {
@@ -745,13 +749,14 @@ class DatabaseBag:
         return Record(topic, stamp_ns, data)
 
 
-def _log_of(path: Path) -> Path:
-    return path.with_name(path.name + "-wal")
+# A transaction that was being written to the file itself.
+_UNDOES = "-journal"
 
 
-def _has_log(path: Path) -> bool:
-    log = _log_of(path)
-    return log.exists() and log.stat().st_size > 0
+def _logs_of(path: Path) -> list[Path]:
+    """What a killed recorder left beside the file."""
+    logs = [path.with_name(path.name + suffix) for suffix in ("-wal", _UNDOES)]
+    return [log for log in logs if log.exists() and log.stat().st_size > 0]
 
 
 def _connected(path: Path, mode: str) -> sqlite3.Connection:
