@@ -18,7 +18,8 @@ import numpy as np
 
 from engram.fleet.transfers import Manifest, PartHash, split
 from engram.frontend.blobs import decode_landmarks
-from engram.frontend.frame import Frame, FrameStatus
+from engram.frontend.frame import Frame, FrameStatus, Landmarks
+from engram.frontend.ranked import RankedLandmarks
 from engram.geometry.se3 import SE3
 from engram.graph.model import (
     Amendable,
@@ -206,10 +207,18 @@ def _record(writer: FrameLogWriter) -> None:
             if at
             else OdometryStep(OdometryStatus.FIRST)
         )
-        writer.append(LoggedFrame(frame_of(1_000 + at * 10**8), step), f"pair{at}")
+        frame = frame_of(1_000 + at * 10**8)
+        ranked = None if isinstance(writer, FlightWriter) else _ranked(frame.landmarks)
+        writer.append(LoggedFrame(frame, step), f"pair{at}", ranked)
         if isinstance(writer, FlightWriter):
             writer.add_decision({"status": "localised", "node": at})
             writer.add_images(*_images())
+
+
+def _ranked(own: Landmarks) -> RankedLandmarks:
+    """A frame's landmarks, and half of them again as later choices."""
+    more = own.rows(slice(0, len(own), 2))
+    return RankedLandmarks.joined(own, more, np.arange(len(own) + len(more), dtype=np.uint16))
 
 
 def _images() -> tuple[bytes, bytes]:

@@ -385,8 +385,9 @@ _READERS: tuple[Callable[[Map], object], ...] = (
 def _read_drive(path: Path) -> bool:
     try:
         log = FrameLog(path)
-        for one in log:
+        for at, one in enumerate(log):
             assert one.frame.stamp_ns is not None
+            log.ranked(at)
     except EngramError:
         return False
     if path.suffix == FLIGHT_SUFFIX:
