@@ -358,6 +358,24 @@ STUDIES: Mapping[str, Study] = {
         real=True,
         town=False,
     ),
+    "power-cuts": Study(
+        (f"{_CHECKS}power_cuts --cuts 2000 --json {{out}}/figures.json",),
+        12,
+        ("figures.json",),
+        ("docs/evidence.md",),
+        town=False,
+    ),
+    "mutations": Study(
+        (
+            f"{_CHECKS}mutations --cases 20000 --out {{out}}/cases.jsonl "
+            "--json {out}/figures.json",
+        ),
+        60,
+        ("figures.json",),
+        ("docs/evidence.md",),
+        town=False,
+        resumes=True,
+    ),
 }
 
 

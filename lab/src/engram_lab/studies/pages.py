@@ -46,6 +46,10 @@ class Figures:
         self._path = path
         self._parts: dict[str, list[dict[str, Any]]] = json.loads(path.read_text(encoding="utf-8"))
 
+    def of_part(self, part: str) -> dict[str, float]:
+        """All of a part, by name."""
+        return {one["name"].strip(): float(one["value"]) for one in self._parts[part]}
+
     def value(self, part: str, name: str, below: str = "") -> float:
         """One by its name, or the first of another name below it."""
         rows = next((some for title, some in self._parts.items() if title.startswith(part)), [])
@@ -137,6 +141,35 @@ def kills(tables: Path) -> Iterator[str]:
     yield "(`python -m engram_lab.checks.kill_mapping`)."
 
 
+def power_cuts(tables: Path) -> Iterator[str]:
+    """What power cuts leave of maps."""
+    found = Figures(tables / "power-cuts/figures.json")
+    cuts, faults = (int(found.value("power cuts", name)) for name in ("cuts", "faults"))
+    yield (
+        f"{cuts:,} power cuts amid mapping, merging and forgetting, on a disk that keeps only what "
+        "was synced, lost"
+    )
+    yield f"{_none(faults)} of what was stored (`python -m engram_lab.checks.power_cuts`)."
+
+
+def mutations(tables: Path) -> Iterator[str]:
+    """What damaged and hostile files do to their readers."""
+    counts = Figures(tables / "mutations/figures.json").of_part("mutations")
+    faults = int(sum(counts.values()) - counts["read"] - counts["refused"])
+    yield (
+        f"Of {int(sum(counts.values())):,} maps, drives, hand-ins and texts with damage or malice "
+        f"in them, {_none(faults)} crashed"
+    )
+    yield (
+        "a reader, hung it, ran code or passed for sound although it had changed "
+        "(`python -m engram_lab.checks.mutations`)."
+    )
+
+
+def _none(count: int) -> str:
+    return f"{count:,}" if count else "none"
+
+
 def hand_ins(tables: Path) -> Iterator[str]:
     """What an evening of hand-ins costs a centre."""
     found = Figures(tables / "hand-ins/figures.json")
@@ -145,7 +178,7 @@ def hand_ins(tables: Path) -> Iterator[str]:
     ratio = found.value(evening, "a hand-in, seconds of a core: last by first medians")
     yield (
         "Of 40 drives of 300 nodes, handed in at once to 100,000 nodes, "
-        f"{failed or 'none'} failed. To merge them took"
+        f"{_none(failed)} failed. To merge them took"
     )
     yield (
         f"{found.value(evening, 'of a core, merging'):.1f} min of a core, the last five "
@@ -505,6 +538,8 @@ BLOCKS: Mapping[str, Block] = {
     "robot-needs": Block("robot-needs", robot_needs),
     "eyes": Block("eyes", eyes),
     "kills": Block("kills", kills),
+    "power-cuts": Block("power-cuts", power_cuts),
+    "mutations": Block("mutations", mutations),
     "hand-ins": Block("hand-ins", hand_ins),
     "scale": Block("scale", scale),
     "scale-in-short": Block("scale", scale_in_short),
