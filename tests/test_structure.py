@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import engram
@@ -40,7 +41,8 @@ class Class:
     holds: set[str] = field(default_factory=set)
 
 
-def _parsed() -> dict[str, ast.Module]:
+@cache
+def _files() -> dict[str, ast.Module]:
     root = Path(engram.__file__).parent
     return {
         str(path.relative_to(root)): ast.parse(path.read_text(encoding="utf-8"))
@@ -48,11 +50,8 @@ def _parsed() -> dict[str, ast.Module]:
     }
 
 
-FILES = _parsed()
-
-
 def _functions() -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
-    for file, tree in FILES.items():
+    for file, tree in _files().items():
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 yield file, node
@@ -102,16 +101,18 @@ def _class(file: str, node: ast.ClassDef) -> Class:
     return found
 
 
-CLASSES = {
-    node.name: _class(file, node)
-    for file, tree in FILES.items()
-    for node in ast.walk(tree)
-    if isinstance(node, ast.ClassDef)
-}
+@cache
+def _classes() -> dict[str, Class]:
+    return {
+        node.name: _class(file, node)
+        for file, tree in _files().items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+    }
 
 
 def _ancestors(name: str) -> Iterator[str]:
-    for base in CLASSES[name].bases if name in CLASSES else ():
+    for base in _classes()[name].bases if name in _classes() else ():
         yield base
         yield from _ancestors(base)
 
@@ -119,7 +120,7 @@ def _ancestors(name: str) -> Iterator[str]:
 def _values() -> set[str]:
     """Names of classes that are used otherwise than as a type or as a base."""
     used = set()
-    for tree in FILES.values():
+    for tree in _files().values():
         types: set[int] = set()
         for node in ast.walk(tree):
             for part in (
@@ -153,13 +154,13 @@ def test_functions_take_few_parameters() -> None:
 
 def test_no_class_is_there_only_to_be_the_base_of_one_other() -> None:
     children: dict[str, int] = {}
-    for one in CLASSES.values():
+    for one in _classes().values():
         for base in one.bases:
             children[base] = children.get(base, 0) + 1
     used = _values()
     only = {
         name
-        for name in CLASSES
+        for name in _classes()
         if children.get(name) == 1
         and name not in used
         and name not in engram.__all__
@@ -171,9 +172,9 @@ def test_no_class_is_there_only_to_be_the_base_of_one_other() -> None:
 def test_what_wraps_another_of_its_kind_passes_on_every_method() -> None:
     # A method that a wrapper forgets is the base's own: it does nothing, without a word.
     forgotten = {}
-    for name, one in CLASSES.items():
-        for base in set(_ancestors(name)) & one.holds & CLASSES.keys():
-            missing = CLASSES[base].methods - one.methods
+    for name, one in _classes().items():
+        for base in set(_ancestors(name)) & one.holds & _classes().keys():
+            missing = _classes()[base].methods - one.methods
             if missing:
                 forgotten[name, base] = missing
     assert forgotten == {}

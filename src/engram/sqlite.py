@@ -228,9 +228,9 @@ class SqliteFile:
         return connection
 
     def _roll_back(self) -> bool:
-        """Undoes what a killed process or a power cut left of a transaction beside the file.
+        """Undoes what a killed process or a power cut left of a transaction next to the file.
 
-        Readers cannot: they have it open for reading only. False if nobody may write here.
+        Readers cannot: they have it open for reading only. False where this process may not write.
         """
         if not (os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK)):
             return False

@@ -96,7 +96,9 @@ def _place(path: Path) -> str:
     return path.relative_to(SOURCE).as_posix()
 
 
-TEXTS = [one for one in texts() if not one[0].startswith("fleet/centre/pages")]
+@cache
+def all_texts() -> list[tuple[str, int, str]]:
+    return [one for one in texts() if not one[0].startswith("fleet/centre/pages")]
 
 
 def command(words: tuple[str, ...]) -> Any:
@@ -142,14 +144,14 @@ def named_commands(text: str) -> Iterator[tuple[Any, str, str]]:
 
 
 def test_the_texts_are_found() -> None:
-    assert len(TEXTS) > 2000
-    assert sum(bool(_VERB.search(text)) for _, _, text in TEXTS) > 50
+    assert len(all_texts()) > 2000
+    assert sum(bool(_VERB.search(text)) for _, _, text in all_texts()) > 50
 
 
 def test_every_verb_that_a_text_names_exists() -> None:
     wrong = [
         f"{place}:{line}: engram {words}"
-        for place, line, text in TEXTS
+        for place, line, text in all_texts()
         for what, words, _ in named_commands(text)
         if what is None
     ]
@@ -158,7 +160,7 @@ def test_every_verb_that_a_text_names_exists() -> None:
 
 def test_every_option_behind_a_verb_is_one_of_it() -> None:
     wrong = []
-    for place, line, text in TEXTS:
+    for place, line, text in all_texts():
         for what, words, rest in named_commands(text):
             # What follows in another clause is said of the verb that speaks.
             typed = re.split(r"[;,]|: | or ", rest)[0]
@@ -172,7 +174,7 @@ def test_every_option_behind_a_verb_is_one_of_it() -> None:
 
 def test_every_option_is_one_of_the_verbs_that_speak() -> None:
     wrong = []
-    for place, line, text in TEXTS:
+    for place, line, text in all_texts():
         verbs = next((_SPOKEN_BY[part] for part in _SPOKEN_BY if place.startswith(part)), ())
         ours = _PIP.sub("", _VERB.split(text)[0])
         for option in _OPTION.findall(ours):
@@ -186,7 +188,7 @@ def test_every_option_is_one_of_the_verbs_that_speak() -> None:
 
 def test_every_extra_that_a_text_names_exists() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    named = {extra for _, _, text in TEXTS for extra in _EXTRA.findall(text)}
+    named = {extra for _, _, text in all_texts() for extra in _EXTRA.findall(text)}
     assert len(named) > 5
     assert named <= project["optional-dependencies"].keys()
 
@@ -196,7 +198,7 @@ def test_every_setting_that_a_text_names_exists() -> None:
     tables = {key.split(".")[0] for key in known}
     named = {
         (place, f"{table}.{key}")
-        for place, _, text in TEXTS
+        for place, _, text in all_texts()
         for table, key in _SETTING.findall(text)
         if table in tables and " " in text
     }
@@ -207,7 +209,7 @@ def test_every_setting_that_a_text_names_exists() -> None:
 def test_what_the_laboratory_brings_is_named_as_its_own() -> None:
     wrong = [
         f"{place}:{line}: {text}"
-        for place, line, text in TEXTS
+        for place, line, text in all_texts()
         for found in _VERB.finditer(text)
         if found[1] in LABORATORY and "engram-lab" not in text
         if place != "cli/app.py"  # it asks whether the laboratory is installed
@@ -240,7 +242,7 @@ def test_no_text_proposes_a_verb_whose_extra_may_be_missing() -> None:
     aware = {"cli/wording.py", "cli/trying.py", "cli/frame.py"}
     wrong = [
         f"{place}:{line}: {text}"
-        for place, line, text in TEXTS
+        for place, line, text in all_texts()
         for found in _VERB.finditer(text)
         if found[1] in {"plot", "view"} and place not in aware and _EXTRA.search(text) is None
     ]

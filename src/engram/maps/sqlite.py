@@ -360,9 +360,9 @@ def _log(path: Path) -> Path:
 
 
 def _has_log(path: Path) -> bool:
-    """Whether a log lies beside a file, or what undoes an interrupted transaction."""
-    beside = _log(path), path.with_name(f"{path.name}-journal")
-    return any(one.exists() and one.stat().st_size > 0 for one in beside)
+    """Whether a log lies next to a file, or what undoes an interrupted transaction."""
+    logs = _log(path), path.with_name(f"{path.name}-journal")
+    return any(log.exists() and log.stat().st_size > 0 for log in logs)
 
 
 def _state(path: Path) -> tuple[int, int, int] | None:

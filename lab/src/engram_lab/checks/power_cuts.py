@@ -83,7 +83,7 @@ class Done:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The paths that it gives or takes away."""
+        """The paths that it gives or removes."""
         return (self.path, self.data.decode()) if self.data else (self.path,)
 
 
@@ -128,7 +128,7 @@ class Disk:
             self.unsynced.setdefault(done.file, []).append(done)
 
     def name(self, done: Done) -> None:
-        """Gives or takes a name."""
+        """Gives or removes a name."""
         if done.deed is Deed.CREATE:
             self.names[done.path] = done.file
         elif done.deed is Deed.UNLINK:
@@ -140,7 +140,7 @@ class Disk:
                 del self.names[done.path]
 
     def write(self, done: Done) -> None:
-        """Writes or truncates for good."""
+        """Writes or truncates permanently."""
         content = self.contents.setdefault(done.file, bytearray())
         if done.deed is Deed.TRUNCATE:
             del content[done.length :]

@@ -155,7 +155,7 @@ def _make_logged(town: Path, path: Path) -> None:
 
 
 def drive_steps(store: Map, drive: Session) -> Generator[str, None, list[NodeId]]:
-    """Adds a drive of a few nodes, with a checkpoint on its way."""
+    """Adds a drive of a few nodes, with a checkpoint after the second."""
     writer = store.begin_session(
         drive,
         CAMERA,

@@ -754,7 +754,7 @@ _UNDOES = "-journal"
 
 
 def _logs_of(path: Path) -> list[Path]:
-    """What a killed recorder left beside the file."""
+    """What a killed recorder left next to the file."""
     logs = [path.with_name(path.name + suffix) for suffix in ("-wal", _UNDOES)]
     return [log for log in logs if log.exists() and log.stat().st_size > 0]
 
