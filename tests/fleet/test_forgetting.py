@@ -170,7 +170,8 @@ def test_a_cap_takes_first_what_serves_least(centre: Path, fleet) -> None:
     """The drives of the first 24 m are alike but for one that looks different."""
     alone = fleet["other"][1].saved
     with Map.open(centre) as store:
-        stock, size_bytes = Stock(store), store.info().size_bytes
+        stock = Stock(store)
+        size_bytes = sum(map(sum, stock.sizes)) + 2600 * len(stock)
         order = [stock.node_ids[at] for at in serving_order(stock)]
         assert sorted(order) == sorted(stock.node_ids)
         first = np.isin(np.arange(len(stock)), serving_order(stock)[: len(stock) // 2])
@@ -190,6 +191,19 @@ def test_a_cap_takes_first_what_serves_least(centre: Path, fleet) -> None:
         forget(centre, Retention(down_to=(10**12, None)), author="tests")
     assert forget(centre, Retention(down_to=(None, 50.0)), author="tests").nodes == len(half)
     assert check_file(centre).problems == ()
+
+
+def test_a_cap_that_is_kept_takes_nothing_more(centre: Path) -> None:
+    """What is forgotten stays in the file until it is erased, but counts no longer."""
+    cap_bytes = int(0.7 * centre.stat().st_size)
+    cap = Retention(down_to=(cap_bytes, None))
+    forgotten = forget(centre, cap, author="tests")
+    before_bytes = centre.stat().st_size
+    assert before_bytes > cap_bytes
+    with pytest.raises(RevisionError, match="nothing that is to be forgotten"):
+        forget(centre, cap, author="tests")
+    erase_map(centre)
+    assert before_bytes - centre.stat().st_size > forgotten.size_bytes > 0
 
 
 def test_where_nothing_lies_nothing_is_forgotten(centre: Path) -> None:

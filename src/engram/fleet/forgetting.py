@@ -45,8 +45,9 @@ class Retention:
         older_than_days: age of drives from their starts; None for any. Drives whose time is unknown
             are not old.
         pictures: whether only pictures go.
-        down_to: bytes of the file, or per cent of them, that may stay (`budget_from_text`): of all
-            this only the nodes go that serve least. Both None for no such limit.
+        down_to: bytes of the nodes, or per cent of them, that may stay (`budget_from_text`): of all
+            this only the nodes go that serve least, and none once the rest takes no more. Both None
+            for no such limit.
     """
 
     sessions: Sequence[str] = ()
@@ -87,15 +88,17 @@ class Retention:
         self, store: Map, drives: frozenset[SessionId], inside: frozenset[NodeId] | None
     ) -> frozenset[NodeId]:
         """Nodes that go so that the rest takes `down_to`; see `serving_order`."""
-        of_bytes, (most_bytes, percent) = store.info().size_bytes, self.down_to
+        stock, (most_bytes, percent) = Stock(store), self.down_to
+        landmarks, pictures = stock.sizes
+        sizes = landmarks + pictures + _NODE_BYTES
+        of_bytes = int(sizes.sum())
         if percent is not None:
             most_bytes = int(of_bytes * percent / 100)
         assert most_bytes is not None
         if of_bytes <= most_bytes:
             return frozenset()
-        stock = Stock(store)
-        landmarks, pictures = stock.sizes
-        sizes = pictures if self.pictures else landmarks + pictures + _NODE_BYTES
+        if self.pictures:
+            sizes = pictures
         may_go = np.array(
             [
                 node.session in drives and (inside is None or node.id in inside)
@@ -108,7 +111,8 @@ class Retention:
         count = int(np.searchsorted(freed, of_bytes - most_bytes)) + 1
         if count > len(going):
             raise InputError(
-                f"of {of_bytes} bytes {sizes[may_go].sum()} may go: {most_bytes} are not reached"
+                f"of {of_bytes} bytes of nodes {sizes[may_go].sum()} may go: {most_bytes} are not "
+                "reached"
             )
         return frozenset(stock.node_ids[at] for at in going[:count].tolist())
 
