@@ -9,7 +9,8 @@ fresh robot takes the same frames, in blocks that alternate with those of the ol
 Logged: the first eight frame logs of folder HOME, drives of one town, become a map as usual. All
 others are added by robots that cannot relocalise, which save all they see, until the map has so
 many nodes; then it is not changed any more. The third log of HOME is driven there and back, at two
-attempts a frame, and its old robot is compared with a fresh one as above.
+attempts a frame, and its old robot is compared with a fresh one as above. With `--maps` both map,
+each in a copy of that map.
 
 Ratios are of processor time, all threads of the process: medians over blocks, with quartiles.
 """
@@ -22,11 +23,14 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from functools import partial
 from pathlib import Path
 
 from engram.frontend.frame import StereoPair
+from engram.geometry.cameras import StereoCamera
 from engram.maps.map import Map, open_map
+from engram.maps.map_files import copy_map
 from engram.odometry.step import OdometryStatus, OdometryStep
 from engram.robot.mapping import map_drive
 from engram.robot.robot import Robot
@@ -65,7 +69,9 @@ def localising(frames: int) -> Iterator[Figure]:
 
 
 def aged(
-    robot: Callable[[], Robot], frame_at: Callable[[int], StereoPair | LoggedFrame], frames: int
+    robot: Callable[[], AbstractContextManager[Robot]],
+    frame_at: Callable[[int], StereoPair | LoggedFrame],
+    frames: int,
 ) -> Iterator[Figure]:
     """What a robot's memory grew by in so many frames, and its blocks against a fresh one's."""
     settled = min(1000, frames)
@@ -88,8 +94,10 @@ def aged(
             )
 
 
-def logged(frames: int, nodes: int, home: Path, others: Sequence[Path]) -> Iterator[Figure]:
-    """The same from frame logs, in a map of so many nodes."""
+def logged(
+    frames: int, nodes: int, home: Path, others: Sequence[Path], *, maps: bool = False
+) -> Iterator[Figure]:
+    """The same from frame logs, in a map of so many nodes; `maps` says whether robots map, too."""
     logs = sorted(home.glob("*.framelog"))
     with tempfile.TemporaryDirectory(prefix="engram-soak-") as folder:
         path = Path(folder) / "fixed.engram"
@@ -106,11 +114,28 @@ def logged(frames: int, nodes: int, home: Path, others: Sequence[Path]) -> Itera
             yield Figure("nodes of the map", len(opened.graph))
             camera = entries[0].frame.camera
             robot = partial(opened.robot, camera, lanes=1, rounds=2)
-            yield from aged(robot, there_and_back(entries), frames)
+            mapper = partial(_mapper, path, camera)
+            yield from aged(mapper if maps else robot, there_and_back(entries), frames)
             with robot() as judge:
                 lap = map(judge.step, map(there_and_back(entries), range(2 * len(entries) - 2)))
                 share = statistics.mean(one.localised for one in lap)
             yield Figure("share of a lap's frames localised", share)
+
+
+def _copied(path: Path, folder: Path) -> Path:
+    copy_map(path, folder / path.name)
+    return folder / path.name
+
+
+@contextmanager
+def _mapper(path: Path, camera: StereoCamera) -> Iterator[Robot]:
+    """A robot that maps in a copy of a map."""
+    with (
+        tempfile.TemporaryDirectory(dir=path.parent) as folder,
+        open_map(_copied(path, Path(folder))) as opened,
+        opened.robot(camera, lanes=1, rounds=2, name="mapper", maps=True) as robot,
+    ):
+        yield robot
 
 
 def there_and_back(entries: Sequence[LoggedFrame]) -> Callable[[int], LoggedFrame]:
@@ -176,11 +201,13 @@ def main() -> None:
     parser.add_argument("--logs", nargs="+", type=Path, help="folders of frame logs, HOME first")
     parser.add_argument("--frames", type=int, default=7000)
     parser.add_argument("--nodes", type=int, default=4_000)
+    parser.add_argument("--maps", action="store_true", help="logged: the robots map, too")
     given = parser.parse_args()
     if given.what == "localising":
         figures = localising(given.frames)
     elif given.logs:
-        figures = logged(given.frames, given.nodes, given.logs[0], given.logs[1:])
+        home, *others = given.logs
+        figures = logged(given.frames, given.nodes, home, others, maps=given.maps)
     else:
         parser.error("logged: name folders by --logs")
     report(figures, given.json, given.what)
