@@ -339,18 +339,13 @@ def _are_steps(added: Columns) -> NDArray[np.bool_]:
 
 
 def read_in_stretches(connection: Connection, view: View, table: Table) -> Iterator[Columns]:
-    """The visible rows of a table by key, so many at once; one stretch at least."""
+    """The visible rows of a table by key, at most so many at once; one stretch at least."""
     key = table.primary_key.columns[0]
-    last = connection.execute(select(func.max(key))).scalar() or 0
-    start = connection.execute(select(func.min(key))).scalar() or 0
-    while True:
-        query = select(key).where(key >= start).order_by(key).offset(_AT_ONCE - 1).limit(1)
-        end = connection.execute(query).scalar()
-        stop = last if end is None else end
+    start: int | None = connection.execute(select(func.min(key))).scalar() or 0
+    while start is not None:
+        stop = min(start + _AT_ONCE - 1, LARGEST_KEY)
         yield read_columns(connection, view, table, within=(start, stop))
-        if stop >= last:
-            return
-        start = stop + 1
+        start = connection.execute(select(func.min(key)).where(key > stop)).scalar()
 
 
 def _uncounted(connection: Connection, view: View) -> set[int]:

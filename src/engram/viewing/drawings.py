@@ -40,6 +40,8 @@ GOOD, BRIDGED, LOST = "#009e73", "#e69f00", "#d55e00"
 _FEW = "#999999"
 # What stands in a drawing for a page's colours of text, of lesser text and of its background.
 _INK, _MUTED, _PAPER = "#010203", "#040506", "#fcfdfe"
+# Among more points Matplotlib looks for the best place of a legend for a second.
+_MOST_SEARCHED = 100_000
 # A legend longer than this hides the map.
 _NAMED = 12
 # So many parts of a map are drawn; the others are counted.
@@ -232,7 +234,9 @@ def _fill(every: Sequence[Any], panels: Sequence[Panel]) -> None:
 def _add_legend(axes: Any, panel: Panel) -> None:
     if any(track.starts is not None and track.starts.any() for track in panel.tracks):
         axes.plot([], [], "o", color=_MUTED, markerfacecolor=_PAPER, label="first node of a drive")
-    axes.legend(fontsize=8, loc="best", framealpha=0.9)
+    points = sum(len(track.points_m) for track in panel.tracks)
+    loc = "best" if points <= _MOST_SEARCHED else "upper right"
+    axes.legend(fontsize=8, loc=loc, framealpha=0.9)
 
 
 def _draw_track(axes: Any, track: Track, colour: str) -> None:
