@@ -182,9 +182,11 @@ def test_forgetting_is_previewed_then_done_undone_and_erased(engram, town: Path)
     assert engram("log", town, "--json").json[0]["message"] == "forget: asked by the owner"
     assert done.out.splitlines()[-1] == f"to undo: engram revert {town} 3"
     assert engram("revert", town, 3).status == 0
+    old = ("forget", town, "--older-than", "99999d", "--yes")
+    assert engram(*old).out.splitlines() == ["nothing to forget"]
     assert engram(*asked, "--yes", "--json").json["forgotten"]["revision"] == 5
     assert "would be erased: " in engram("forget", town, "--erase").out
-    erased = engram("forget", town, "--erase", "--yes", "--json").json
+    erased = engram(*old, "--erase", "--json").json  # as a job that runs every night
     assert erased["forgotten"] is None
     assert erased["erased"]["rows"]["sessions"] == 1
     assert erased["erased"]["after_bytes"] < erased["erased"]["before_bytes"]

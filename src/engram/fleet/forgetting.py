@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,13 @@ from engram.geometry.se3 import SE3
 from engram.graph.graph import EDGE_KINDS
 from engram.graph.model import Clock, Edge, NodeId, SessionId
 from engram.graph.pages import GraphPage
-from engram.maps.forgetting import Chosen, Erased, Forgotten, erase_map
+from engram.maps.forgetting import (
+    Chosen,
+    Erased,
+    Forgotten,
+    NothingToForgetError,
+    erase_map,
+)
 from engram.maps.map import Map
 
 _NS_PER_DAY = 86_400 * 10**9
@@ -179,7 +186,7 @@ def forget(
 
     Raises:
         InputError: nothing is to be forgotten, or a session is not in the map.
-        RevisionError: the map holds nothing of it.
+        NothingToForgetError: the map holds nothing of it.
         MapLockedError: another process writes to the map.
     """
     with Map.open(path, writes=True) as store:
@@ -196,7 +203,7 @@ def forget(
 
 @dataclass(frozen=True, slots=True)
 class Retained:
-    """What `forget_and_erase` did, or would do; None for what was not requested."""
+    """What `forget_and_erase` did, or would do; None for what was not requested or is not there."""
 
     forgotten: Forgotten | None
     erased: Erased | None
@@ -213,7 +220,8 @@ class Retained:
 
     def text(self) -> str:
         """The result as text."""
-        return "\n".join(one.text() for one in (self.forgotten, self.erased) if one is not None)
+        done = [one.text() for one in (self.forgotten, self.erased) if one is not None]
+        return "\n".join(done) or "nothing to forget"
 
 
 def forget_and_erase(
@@ -221,11 +229,12 @@ def forget_and_erase(
 ) -> Retained:
     """Forgets what is chosen, if anything is, then erases all that is forgotten, if requested.
 
-    See `forget` and `erase_map`.
+    See `forget` and `erase_map`. A map that holds nothing of what is chosen is a result.
     """
     hidden = None
     if not erase or retention != Retention():
-        hidden = forget(path, retention, author=author, why=why, dry_run=dry_run)
+        with suppress(NothingToForgetError):
+            hidden = forget(path, retention, author=author, why=why, dry_run=dry_run)
     return Retained(hidden, erase_map(path, dry_run=dry_run) if erase else None)
 
 

@@ -78,6 +78,10 @@ _ERASED_WITH: dict[Table, dict[str, Table]] = {
 }
 
 
+class NothingToForgetError(RevisionError):
+    """A map holds nothing of what it is to forget."""
+
+
 @dataclass(frozen=True, slots=True)
 class Chosen:
     """What is to be forgotten.

@@ -51,6 +51,7 @@ from engram.maps.difference import STRETCH_M, MapDifference, difference
 from engram.maps.forgetting import (
     Chosen,
     Forgotten,
+    NothingToForgetError,
     hide_chosen,
     load_names,
     result_of,
@@ -843,14 +844,15 @@ class Map:
             dry_run: only report the result.
 
         Raises:
-            RevisionError: there is nothing to forget, or a session is being written.
+            NothingToForgetError: it holds nothing of what is chosen.
+            RevisionError: a session is being written.
             StorageFullError: no space; the map is unchanged.
         """
 
         def forgotten(connection: Connection, own: View, row: Row) -> Forgotten:
             gone = hide_chosen(connection, self._keys, own, row["key"], chosen)
             if not any(gone.values()):
-                raise RevisionError(f"{self.location} holds nothing that is to be forgotten")
+                raise NothingToForgetError(f"{self.location} holds nothing that is to be forgotten")
             write_bridges(connection, self._keys, row["key"], bridges)
             revision = commit_revision(connection, row, *brought(connection, row))
             return result_of(connection, revision.number, gone, len(bridges))

@@ -44,6 +44,7 @@ _PERIOD_NS = 100_000_000
 _BLOCK = 50  # frames
 _BLOCKS = 16  # of each robot
 _WARM = 100  # frames of a fresh robot before it is timed
+_SETTLED = 5_000  # frames of the old one before its memory counts: it has read all of its lap
 _AT_HOME = 8  # logs of the town whose map is used
 _REPORTED = 50_000  # frames between two reports of memory
 
@@ -74,14 +75,15 @@ def aged(
     frames: int,
 ) -> Iterator[Figure]:
     """What a robot's memory grew by in so many frames, and its blocks against a fresh one's."""
-    settled = min(1000, frames)
+    settled = min(_SETTLED, frames)
     with robot() as old:
         drive(old, frame_at, range(settled))
         before_mb = resident_mb()
         for first in range(settled, frames, _REPORTED):
             until = min(first + _REPORTED, frames)
             drive(old, frame_at, range(first, until))
-            yield Figure(f"memory, frames 1,000 to {until:,}", resident_mb() - before_mb, "MB")
+            grown_mb = resident_mb() - before_mb
+            yield Figure(f"memory, frames {settled:,} to {until:,}", grown_mb, "MB")
         with robot() as fresh:
             drive(fresh, frame_at, range(frames, frames + _WARM))
             drive(old, frame_at, range(frames, frames + _WARM))

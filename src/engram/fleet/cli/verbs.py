@@ -487,7 +487,13 @@ def forget(
       engram forget fleet.engram --erase --yes
     """
     from engram.fleet.download.mission import budget_from_text
-    from engram.fleet.forgetting import Retention, age_from_text, forget_and_erase, region_from_text
+    from engram.fleet.forgetting import (
+        Retained,
+        Retention,
+        age_from_text,
+        forget_and_erase,
+        region_from_text,
+    )
 
     retention = Retention(
         tuple(session or ()),
@@ -499,7 +505,7 @@ def forget(
     done = forget_and_erase(
         map_path, retention, author=user(), why=message, erase=erase, dry_run=not yes
     )
-    end = "" if yes else "previewed only: --yes does it"
+    end = "" if yes or done == Retained(None, None) else "previewed only: --yes does it"
     if done.revision is not None and not erase:
         end = undo_text(map_path, done.revision)
     options.show(done, f"{done.text()}\n{end}".rstrip(), as_json=as_json)
