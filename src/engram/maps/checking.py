@@ -114,7 +114,7 @@ _DERIVED = {words, place_blocks, runs}
 _HIDEABLE = {*VERSIONED} - {hidden}
 # Rows of the largest tables that are read at once, and of those with large bodies.
 _MOST = 10_000
-_AT_ONCE = {frames: 20, attempts: 10, vocabularies: 1, place_blocks: 1}
+_AT_ONCE = {frames: 20, attempts: 40, vocabularies: 1, place_blocks: 1}
 _NONE = np.zeros(0, np.int64)
 
 # Rounding of rotations that come from chains of products.

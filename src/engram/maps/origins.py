@@ -149,9 +149,12 @@ def _attempts(connection: Connection, view: View, key: int) -> dict[str, int]:
     hid = np.array(connection.execute(view.hidden_keys(nodes)).scalars().all(), np.int64)
     here = attempts.c.page == int(page_of(np.array(key)))
     found = {"attempts": 0, "matches": 0}
+    if key in hid:
+        return found
     for row in verified(attempts, connection.execute(view.select(attempts).where(here))):
         _, table = unpack(row["body"], row["count"])
-        tried = (table.node == key) & ~np.isin(table.reference, hid) & (key not in hid)
-        found["attempts"] += int(tried.sum())
+        tried = np.flatnonzero(table.node == key)
+        tried = tried[~np.isin(table.reference[tried], hid)]
+        found["attempts"] += len(tried)
         found["matches"] += int(table.accepted[tried].sum())
     return found
