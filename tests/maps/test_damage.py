@@ -30,7 +30,7 @@ from engram.graph.model import path_id
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.maps.rows import sealed
-from engram.maps.schema import edges, nodes, path_entries, placements
+from engram.maps.schema import edges, nodes, path_entries, placements, revisions
 from engram.sqlite import SqliteFile
 
 from .frames import assert_same_landmarks
@@ -411,6 +411,18 @@ class TestCheckSinceARevision:
         insert_row(broken, nodes, {**row, "driven_m": 99.0})
         (problem,) = check_file(broken, since=1).problems
         assert "revision 2: its rows have the content hash" in problem.fact
+
+    @pytest.mark.parametrize("key", [1, 2])
+    def test_a_committed_revision_without_a_number_is_found(self, broken, key):
+        with sqlite3.connect(broken) as connection:
+            connection.row_factory = sqlite3.Row
+            found = connection.execute("SELECT * FROM revisions WHERE key = ?", [key])
+            row = dict(found.fetchone())
+        connection.close()
+        change(broken, "DELETE FROM revisions WHERE key = ?", key)
+        insert_row(broken, revisions, {**row, "number": None})
+        facts = problems(broken)
+        assert any("is committed and has the number None" in fact for fact in facts)
 
     def test_a_revision_that_is_not_there_is_refused(self, broken):
         with pytest.raises(RevisionError, match="1 to 2"):

@@ -349,9 +349,8 @@ class _Checking:
         other = self.revision_rows.get(row["revision"])
         if other is None or other["key"] == revision["key"]:
             return ""
-        if other["status"] != "committed" or (
-            revision["status"] == "committed" and other["number"] > revision["number"]
-        ):
+        later = (other["number"] or 0) > (revision["number"] or 0)  # lacking ones are reported
+        if other["status"] != "committed" or (revision["status"] == "committed" and later):
             name = describe(target, list(row.values()))
             return f"({name} of {target.name}) is of a revision that is not before its own"
         return ""
