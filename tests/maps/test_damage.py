@@ -418,9 +418,11 @@ class TestCheckSinceARevision:
             connection.row_factory = sqlite3.Row
             found = connection.execute("SELECT * FROM revisions WHERE key = ?", [key])
             row = dict(found.fetchone())
+            tie = dict(connection.execute("SELECT * FROM edges WHERE revision = 2").fetchone())
         connection.close()
         change(broken, "DELETE FROM revisions WHERE key = ?", key)
         insert_row(broken, revisions, {**row, "number": None})
+        insert_row(broken, edges, {**tie, "key": 100, "a": 1})  # to a node of the first
         facts = problems(broken)
         assert any("is committed and has the number None" in fact for fact in facts)
 
