@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,38 @@ from engram.maps.rows import camera_row
 from engram.maps.schema import cameras, frontends, path_entries, paths, sessions
 from engram.maps.sqlite import SqliteDatabase
 from engram.maps.view import KeyBook, View
+
+
+class Stretches:
+    """A set of whole numbers, stored by stretches of successive ones.
+
+    A day's path has a million entries, whose sequence numbers follow each other.
+    """
+
+    def __init__(self, numbers: Iterable[int] = ()) -> None:
+        self._firsts: list[int] = []
+        self._lasts: list[int] = []
+        for number in numbers:
+            self.add(number)
+
+    def __contains__(self, number: int) -> bool:
+        at = bisect_right(self._firsts, number) - 1
+        return at >= 0 and number <= self._lasts[at]
+
+    def add(self, number: int) -> None:
+        """Adds a number; no effect if it is there."""
+        if number in self:
+            return
+        after = bisect_right(self._firsts, number)
+        joins = after < len(self._firsts) and self._firsts[after] == number + 1
+        if after > 0 and self._lasts[after - 1] == number - 1:
+            self._lasts[after - 1] = self._lasts.pop(after) if joins else number
+            del self._firsts[after : after + joins]
+        elif joins:
+            self._firsts[after] = number
+        else:
+            self._firsts.insert(after, number)
+            self._lasts.insert(after, number)
 
 
 class References:
@@ -41,7 +74,7 @@ class References:
         self._keys = keys
         self._view = view
         self._rows = rows
-        self._sequences: dict[int, set[int]] = {}
+        self._sequences: dict[int, Stretches] = {}
         with database.reading() as connection:
             self._frontends = {
                 content: key for key, content in reading.load_frontends(connection).items()
@@ -103,9 +136,9 @@ class References:
 
     def begin_path(self, path_key: int) -> None:
         """Announces a path without entries."""
-        self._sequences[path_key] = set()
+        self._sequences[path_key] = Stretches()
 
-    def sequences(self, path_key: int) -> set[int]:
+    def sequences(self, path_key: int) -> Stretches:
         """Sequence numbers of the visible entries of a path; the caller adds new ones."""
         if path_key not in self._sequences:
             query = (
@@ -114,7 +147,7 @@ class References:
                 .where(path_entries.c.path == path_key)
             )
             with self._database.reading() as connection:
-                self._sequences[path_key] = set(connection.execute(query).scalars())
+                self._sequences[path_key] = Stretches(connection.execute(query).scalars())
         return self._sequences[path_key]
 
     def check_node(self, stored: StoredNode) -> None:
