@@ -10,6 +10,7 @@ import sqlite3
 import threading
 from collections.abc import Callable
 from functools import partial
+from itertools import islice
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -31,6 +32,7 @@ from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.maps.rows import sealed
 from engram.maps.schema import edges, nodes, path_entries, placements, revisions
+from engram.maps.totals import read_in_stretches
 from engram.sqlite import SqliteFile
 
 from .frames import assert_same_landmarks
@@ -425,6 +427,20 @@ class TestCheckSinceARevision:
         insert_row(broken, edges, {**tie, "key": 100, "a": 1})  # to a node of the first
         facts = problems(broken)
         assert any("is committed and has the number None" in fact for fact in facts)
+
+    def test_keys_beyond_the_largest_end_a_reading(self, broken):
+        with sqlite3.connect(broken) as connection:
+            connection.row_factory = sqlite3.Row
+            row = dict(connection.execute("SELECT * FROM placements").fetchone())
+        connection.close()
+        insert_row(broken, placements, {**row, "key": 2**63 - 1})
+        with Map.open(broken) as store:
+            parts = store._read(
+                lambda connection, view: list(
+                    islice(read_in_stretches(connection, view, placements), 9)
+                )
+            )
+        assert len(parts) == 2
 
     def test_a_revision_that_is_not_there_is_refused(self, broken):
         with pytest.raises(RevisionError, match="1 to 2"):

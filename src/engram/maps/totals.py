@@ -343,7 +343,7 @@ def read_in_stretches(connection: Connection, view: View, table: Table) -> Itera
     key = table.primary_key.columns[0]
     start: int | None = connection.execute(select(func.min(key))).scalar() or 0
     while start is not None:
-        stop = min(start + _AT_ONCE - 1, LARGEST_KEY)
+        stop = min(start + _AT_ONCE - 1, 2**63 - 1)  # a damaged map may have keys beyond ours
         yield read_columns(connection, view, table, within=(start, stop))
         start = connection.execute(select(func.min(key)).where(key > stop)).scalar()
 
