@@ -29,12 +29,14 @@ from engram import __version__
 from engram.errors import (
     EngramError,
     FormatVersionError,
+    InputError,
     MapCorruptError,
     MapError,
     MapLockedError,
     StorageFullError,
 )
 from engram.files import check_parent
+from engram.untrusted import open_regular
 
 _OLDEST_SQLITE = (3, 37, 0)  # knows STRICT tables
 _CACHE_KIB = 8192
@@ -211,6 +213,11 @@ class SqliteFile:
             address = f"file:{quote(place)}?{options}"
         except UnicodeEncodeError as error:
             raise MapError(f"{place}: the path is not UTF-8; rename file or folder") from error
+        if names_another_file(self.path):
+            raise MapCorruptError(
+                f"{self.path}-journal names another file, as no journal of Engram's does; move it "
+                "away"
+            )
         connection = sqlite3.connect(
             address,
             uri=True,
@@ -222,7 +229,8 @@ class SqliteFile:
             _prepare(connection)
         except sqlite3.Error as error:
             connection.close()
-            if error.sqlite_errorcode != sqlite3.SQLITE_READONLY_ROLLBACK or not self._roll_back():
+            code = getattr(error, "sqlite_errorcode", 0)
+            if code != sqlite3.SQLITE_READONLY_ROLLBACK or not self._roll_back():
                 raise
             return self.connect(options)
         return connection
@@ -317,9 +325,26 @@ class SqliteFile:
         return int(execute(f"PRAGMA {name}").fetchone()[0])
 
 
+def names_another_file(path: Path) -> bool:
+    """Whether a journal next to a file names a super-journal: SQLite deletes it after a rollback.
+
+    A stranger's could name any file. Source: SQLite, "Database File Format", §3.
+    """
+    journal = path.with_name(f"{path.name}-journal")
+    if not journal.exists():
+        return False
+    with os.fdopen(open_regular(journal, InputError), "rb") as file:
+        file.seek(-min(file.seek(0, os.SEEK_END), len(_SUPER)), os.SEEK_END)
+        return bool(file.read() == _SUPER)
+
+
 def is_full(cause: object) -> bool:
     """Whether an error of SQLite means that no space is left."""
     return getattr(cause, "sqlite_errorcode", 0) in _FULL
+
+
+# The last bytes of a journal with a super-journal.
+_SUPER = bytes.fromhex("d9d505f920a163d7")
 
 
 class _FileDialect(SQLiteDialect_pysqlite):

@@ -56,6 +56,15 @@ def interrupt_transaction(path: Path, delete_from: str, target: Path) -> None:
         connection.execute("ROLLBACK")
 
 
+def name_super_journal(path: Path, named: Path) -> None:
+    """Lets the journal of an interrupted transaction name a file, which SQLite then deletes."""
+    name = str(named).encode()
+    page = 2**30 // 4096 + 1
+    record = page.to_bytes(4, "big") + name + len(name).to_bytes(4, "big")
+    with path.with_name(f"{path.name}-journal").open("ab") as journal:
+        journal.write(record + sum(name).to_bytes(4, "big") + bytes.fromhex("d9d505f920a163d7"))
+
+
 def write_image(path: Path, image: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     ok, content = cv2.imencode(path.suffix, image)

@@ -40,6 +40,7 @@ from .synthetic import (
     WIDTH,
     camera,
     interrupt_transaction,
+    name_super_journal,
     picture,
     stamp_ns,
 )
@@ -423,6 +424,16 @@ class TestContainers:
         assert path.read_bytes() != source.read_bytes()
         assert_whole(open_drive(path.parent))
         assert len(list(path.parent.iterdir())) == 2  # the recording itself is left alone
+
+    def test_a_journal_deletes_no_file_that_it_names(self, tmp_path) -> None:
+        source = bare_file(WHOLE.write(tmp_path / "whole", "sqlite"), "sqlite")
+        path, named = tmp_path / "killed" / "drive_0.db3", tmp_path / "photographs.txt"
+        interrupt_transaction(source, "messages", path)
+        name_super_journal(path, named)
+        named.write_text("mine")
+        with pytest.raises(SequenceError, match="names another file"):
+            open_drive(path.parent)
+        assert named.read_text() == "mine"
 
     def test_what_a_killed_recorder_of_ros_1_leaves(self, tmp_path) -> None:
         path = WHOLE.write(tmp_path / "b", "ros1").rename(tmp_path / "b.bag.active")

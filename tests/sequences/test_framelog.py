@@ -42,6 +42,7 @@ from .synthetic import (
     interrupt_transaction,
     log_header,
     logged,
+    name_super_journal,
     only_engram_errors,
     pair_hash,
     picture,
@@ -287,6 +288,17 @@ def test_an_interrupted_transaction_is_undone(tmp_path: Path) -> None:
     assert path.read_bytes() != whole.read_bytes()
     assert len(list(FrameLog(path))) == 40
     assert [one.name for one in path.parent.iterdir()] == [path.name]
+
+
+def test_a_journal_deletes_no_file_that_it_names(tmp_path: Path) -> None:
+    path, named = tmp_path / "cut" / "a.framelog", tmp_path / "photographs.txt"
+    whole = write_log(tmp_path / "a.framelog", [logged(index) for index in range(40)])
+    interrupt_transaction(whole, "frames", path)
+    name_super_journal(path, named)
+    named.write_text("mine")
+    with pytest.raises(MapCorruptError, match="names another file"):
+        FrameLog(path)
+    assert named.read_text() == "mine"
 
 
 def test_nobody_can_undo_a_transaction_on_read_only_media(tmp_path: Path, monkeypatch) -> None:

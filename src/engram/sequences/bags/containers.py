@@ -36,6 +36,7 @@ from types import MappingProxyType
 from typing import Any, BinaryIO, Protocol
 
 from engram.errors import MissingExtraError, SequenceError
+from engram.sqlite import names_another_file
 from engram.untrusted import open_regular
 
 # A chunk or message of this size holds 64 megapixels in colour: no camera sends more.
@@ -656,6 +657,8 @@ class DatabaseBag:
             if not logs:
                 return _connected(self.path, "mode=ro&immutable=1")
             if any(log.name.endswith(_UNDOES) for log in logs):
+                if names_another_file(self.path):
+                    raise DamageError(f"{self.path}{_UNDOES} names another file; move it away")
                 return _connected(self._copied(), "mode=rw")
             # What a killed recorder did not move into the file lies beside it. SQLite reads both
             # only where it can write an index beside them: not on a disk that is read-only.
@@ -763,7 +766,7 @@ def _connected(path: Path, mode: str) -> sqlite3.Connection:
     database = sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True)
     database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BYTES)
     database.execute("PRAGMA trusted_schema = OFF")
-    # The file is open for reading only; this lets SQLite read one that was cut short.
+    # Only an interrupted transaction is undone, in a copy. This lets SQLite read one cut short.
     database.execute("PRAGMA writable_schema = ON")
     return database
 
