@@ -131,6 +131,26 @@ def test_arrows_point_along_the_line() -> None:
     assert headings == pytest.approx([90.0, 180.0])
 
 
+def test_drives_the_same_way_share_their_arrows_and_others_keep_theirs() -> None:
+    road = np.column_stack([np.arange(41.0), np.zeros(41)])
+    one_way = _arrows([road], spacing_m=10.0)
+    assert _places(_arrows([road] * 50, spacing_m=10.0)) == _places(one_way)
+    headings = [heading_rad for _, heading_rad in _arrows([road, road[::-1]], spacing_m=10.0)]
+    assert headings == pytest.approx([0.0] * 4 + [np.pi] * 4)
+
+
+def _places(arrows: list[tuple[np.ndarray, float]]) -> list[tuple[float, ...]]:
+    return [tuple(place.tolist()) for place, _ in arrows]
+
+
+def test_nodes_that_are_one_dot_are_drawn_once() -> None:
+    lap_m = np.column_stack([np.arange(0.0, 1000.0, 10.0), np.zeros(100)])
+    laps = [lap_m + [0.0, 1e-3 * number] for number in range(30)]
+    figure = draw_parts([Panel("city", [Track("monday", np.concatenate(laps))])])
+    drawn = figure.axes[0].lines[0].get_xydata()
+    np.testing.assert_array_equal(drawn, lap_m)
+
+
 def test_a_page_gets_its_own_colours_and_a_text_for_the_blind() -> None:
     track = Track("a", np.array([[0.0, 0.0], [1.0, 2.0]]), chain=np.zeros(2, np.int64))
     drawn = as_svg(draw_parts([Panel("a title", [track])]), "a <map> from above")

@@ -48,6 +48,8 @@ _NAMED = 12
 _PARTS = 6
 # Arrows along a track: so many over the width of the drawing.
 _ARROWS = 10
+# Points nearer to each other than this share of the drawing's width are one dot.
+_DOTS = 2000
 _WIDTH_IN = 9.0
 
 
@@ -242,15 +244,16 @@ def _add_legend(axes: Any, panel: Panel) -> None:
 def _draw_track(axes: Any, track: Track, colour: str) -> None:
     lines = track.lines()
     x, y = track.points_m[:, 0], track.points_m[:, 1]
-    axes.plot(x, y, track.mark, color=colour, markersize=3 if lines else 5)
+    extent_m = float(np.ptp(track.points_m, axis=0).max(initial=0.0))
+    seen = _one_of_each(_cells(track.points_m, extent_m / _DOTS))
+    axes.plot(x[seen], y[seen], track.mark, color=colour, markersize=3 if lines else 5)
     if track.label:
         axes.plot([], [], "-" if lines else track.mark, color=colour, label=_shown(track.label))
     if lines:  # one artist for all of them, with gaps between
         gap = np.full((1, 2), np.nan)
         drawn = np.concatenate([part for line in lines for part in (line, gap)])
         axes.plot(drawn[:, 0], drawn[:, 1], "-", color=colour, linewidth=1.4, alpha=0.8)
-    spacing_m = max(float(np.ptp(track.points_m, axis=0).max(initial=0.0)) / _ARROWS, 1.0)
-    for place, heading_rad in _arrows(lines, spacing_m):
+    for place, heading_rad in _arrows(lines, max(extent_m / _ARROWS, 1.0)):
         marker = (3, 0, float(np.rad2deg(heading_rad)) - 90.0)
         axes.plot(*place, marker=marker, color=colour, markersize=7, linestyle="none")
     if track.starts is not None and track.starts.any():
@@ -263,7 +266,10 @@ def _draw_track(axes: Any, track: Track, colour: str) -> None:
 def _arrows(
     lines: Sequence[NDArray[np.float64]], spacing_m: float
 ) -> list[tuple[NDArray[np.float64], float]]:
-    """Places, (2,) metres in the map frame, and headings, radians, of arrows along lines."""
+    """Places, (2,) metres in the map frame, and headings, radians, of arrows along lines.
+
+    Where many lines run the same way there is one arrow for all of them.
+    """
     found = []
     for line in lines:
         steps = np.diff(line, axis=0)
@@ -272,7 +278,24 @@ def _arrows(
             at = int(np.searchsorted(driven_m, at_m))
             heading_rad = float(np.arctan2(steps[at, 1], steps[at, 0]))
             found.append(((line[at] + line[at + 1]) / 2, heading_rad))
-    return found
+    if not found:
+        return []
+    places, headings = (np.array(each) for each in zip(*found, strict=True))
+    quarter = np.rint(headings / (np.pi / 2)).astype(np.int64) % 4
+    return [found[at] for at in _one_of_each(4 * _cells(places, spacing_m / 2) + quarter)]
+
+
+def _cells(points_m: NDArray[np.float64], size_m: float) -> NDArray[np.int64]:
+    """Numbers of the squares of a size, at most 2¹⁶ side by side, in which N points are; (N,)."""
+    if size_m == 0.0:
+        return np.zeros(len(points_m), np.int64)
+    squares: NDArray[np.int64] = np.floor(points_m / size_m).astype(np.int64)
+    return 2**16 * squares[:, 0] + squares[:, 1]
+
+
+def _one_of_each(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where each of the (N,) keys is first, in that order."""
+    return np.sort(np.unique(keys, return_index=True)[1])
 
 
 def _shown(text: str) -> str:
