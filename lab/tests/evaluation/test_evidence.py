@@ -31,6 +31,7 @@ from engram_lab.studies.evidence import (
     words_of,
 )
 from engram_lab.studies.page_pictures import POLICIES, content_of, order_by_policy
+from engram_lab.studies.plan import write_csv
 
 __all__ = ["engram"]
 
@@ -353,3 +354,25 @@ def test_curves_show_each_policy_in_per_cent_with_none_on_the_axis(draw, varies)
         assert shown["Γ(distance)"] == pytest.approx([40, 10])
         assert shown["recall"] == pytest.approx([4, 0])
         assert axes.get_ylim()[0] < 0
+
+
+def test_ranking_on_wet_roads_is_pooled_apart_by_metres_driven(tmp_path: Path) -> None:
+    drives = {
+        "000-0901T0900-overcast-wildcat": ("100", "0.1"),
+        "004-0905T1300-overcast-wildcat": ("300", "0.02"),
+        "010-0911T1100-rain-wildcat": ("200", "0.5"),
+    }
+    rows = [
+        _swept(policy, lanes, "", 0.0)
+        | {"fold": "0", "drive": drive, "driven_m": driven, "share_not_localised": missed}
+        for policy in ("distance", "path", "recall")
+        for lanes in ("1", "2", "4")
+        for drive, (driven, missed) in drives.items()
+    ]
+    (tmp_path / "ranking-wet").mkdir()
+    write_csv(tmp_path / "ranking-wet/sessions.csv", rows)
+    table = [one for one in pages.ranking_wet(tmp_path) if one.startswith("| 2 dry | `distance`")]
+    # (100 m · 10 % + 300 m · 2 %) / 400 m; its interval is that of the two drives
+    assert table == [f"| 2 dry | `distance` | {' | '.join(['0.00; 4.00 (2.00 … 10.00)'] * 3)} |"]
+    (wet,) = [one for one in pages.ranking_wet(tmp_path) if one.startswith("| 1 in rain")]
+    assert wet.count("0.00; 50.00 (50.00 … 50.00)") == 3

@@ -28,7 +28,8 @@ from engram_lab.intervals import Interval, Resamples, SessionSums, difference
 from engram_lab.studies.budgets import in_short
 from engram_lab.studies.evidence import MANIFEST, STUDIES, State, read_manifest
 from engram_lab.studies.page_pictures import pictures
-from engram_lab.studies.paper_figures import Row, pooled, read, sessions_of
+from engram_lab.studies.paper_figures import Row, pooled, read, sessions_of, share_of, usual
+from engram_lab.studies.ranking_report import is_wet
 from engram_lab.studies.year import quarters
 
 # Below the root of a checkout.
@@ -127,6 +128,56 @@ def robot_needs(tables: Path) -> Iterator[str]:
             for size in ("512", "full")
         )
         yield f"| {words} | {' | '.join(f'{one:.1f} ms' for one in times_ms)} |"
+
+
+# Stages of `engram lab bench`, without their sizes.
+_STAGES: Mapping[str, str] = {
+    "front-end and odometry": "frontend_odometry",
+    "the same with the window": "frontend_odometry_windowed",
+    "an attempt that succeeds": "attempt",
+    "an attempt in vain": "attempt_hopeless",
+    "a localised robot's step": "robot_step",
+}
+
+
+def bench(tables: Path) -> Iterator[str]:
+    """Time of the stages, and how much longer a plain pipeline takes."""
+    found = json.loads((tables / "bench/1.txt").read_text(encoding="utf-8"))
+    isa = {"v4": "AVX-512", "v3": "AVX2"}.get(found["machine"]["isa"], "neither AVX2 nor AVX-512")
+    yield f"| median on one core, {isa} | 512×384 | 1226×370 | OpenCV pipeline takes |"
+    yield "| --- | --- | --- | --- |"
+    for words, stage in _STAGES.items():
+        small, full = (found["stages"][f"{stage}_{size}"] for size in ("512", "full"))
+        ratios = [one["ratio"] for one in (small, full) if one["ratio"]]
+        longer = f"{min(ratios):.0f} to {max(ratios):.0f} times as long" if ratios else ""
+        yield f"| {words} | {small['ms']:.2g} ms | {full['ms']:.2g} ms | {longer} |"
+
+
+_LOADED = (2000, 20000)
+_MEMORY, _SECOND = "memory of the centre's processes", "second robot's download, first byte"
+
+
+def centre(tables: Path) -> Iterator[str]:
+    """What a centre of fifty robots answers in time, and takes."""
+    every = [Figures(tables / f"centre/{nodes}.json") for nodes in _LOADED]
+    robots = "50 agents"
+    rows: Mapping[str, Callable[[Figures], str]] = {
+        "answers within 0.2 s": lambda one: (
+            f"{one.value(robots, 'answers within 0.2 s'):.1f} % of "
+            f"{one.value(robots, 'answers'):,.0f}"
+        ),
+        "failed answers": lambda one: f"{one.value(robots, 'server errors'):.0f}",
+        "drives handed in": lambda one: f"{one.value(robots, 'forays handed in'):.0f}",
+        "50 nodes merged": lambda one: (
+            f"{one.value(robots, 'the same, of a core of the centre'):.1f} s of a core"
+        ),
+        "memory of the centre": lambda one: f"{one.value(robots, _MEMORY):.1f} GB",
+        "a second robot's download, first byte": lambda one: f"{one.value(robots, _SECOND):.2f} s",
+    }
+    yield f"| 50 robots; nodes in the map | {' | '.join(f'{one:,}' for one in _LOADED)} |"
+    yield f"| --- |{' --- |' * len(_LOADED)}"
+    for words, told in rows.items():
+        yield f"| {words} | {' | '.join(map(told, every))} |"
 
 
 def kills(tables: Path) -> Iterator[str]:
@@ -314,6 +365,47 @@ def ranking(tables: Path, study: str = "ranking") -> Iterator[str]:
         yield f"| `{policy}` | {' | '.join(cells)} |"
 
 
+def _ranked(groups: Mapping[str, Sequence[Row]]) -> Iterator[str]:
+    """The same by groups of drives, from the rows of sessions."""
+    yield f"P(> 10 m); route not localised, per cent, {_LEVEL}:"
+    yield from ("", f"| drives | policy | {' | '.join(_LANES)} |")
+    yield f"| --- | --- |{' --- |' * len(_LANES)}"
+    for words, rows in groups.items():
+        first = f"{len({one['drive'] for one in rows})} {words}"
+        for policy in _RANKED:
+            cells = []
+            for lanes in _LANES:
+                own = [one for one in rows if (one["policy"], one["lanes"]) == (policy, lanes)]
+                failed, gone = (share_of(own, name) for name in ("p_gt_10m", "share_not_localised"))
+                cells.append(
+                    f"{failed.estimate:.2f}; {gone.estimate:.2f} ({gone.low:.2f} … {gone.high:.2f})"
+                )
+            yield f"| {first} | `{policy}` | {' | '.join(cells)} |"
+            first = ""
+
+
+def ranking_wet(tables: Path) -> Iterator[str]:
+    """By drives on dry roads and in rain, through one town."""
+    rows = usual(read(tables / "ranking-wet/sessions.csv"))
+    yield from _ranked(
+        {
+            "dry": [one for one in rows if not is_wet(one["drive"])],
+            "in rain": [one for one in rows if is_wet(one["drive"])],
+        }
+    )
+
+
+def ranking_elsewhere(tables: Path) -> Iterator[str]:
+    """By campaign: a bicycle's, and one in both directions behind traffic."""
+    rows = usual(read(tables / "ranking-elsewhere/sessions.csv"))
+    yield from _ranked(
+        {
+            f"of `{name}`": [one for one in rows if one["campaign"].split()[0] == name]
+            for name in ("keble", "oxford")
+        }
+    )
+
+
 def starved(tables: Path) -> Iterator[str]:
     """The same with a front-end as weak as the paper's, and how fast its maps grow."""
     yield from ranking(tables, "starved")
@@ -423,9 +515,14 @@ _HELD_OUT = {
 }
 
 
-def fleet(tables: Path) -> Iterator[str]:
+_FLEET_ARMS = {"A": "Γ(distance)", "B": "`recall`"}
+
+
+def fleet(
+    tables: Path, study: str = "fleet", arms: Mapping[str, str] = _FLEET_ARMS
+) -> Iterator[str]:
     """[G16]'s claims against ours: one agent and four groups, downloads for an hour."""
-    sessions, summary = (read(tables / f"fleet/{name}.csv") for name in ("sessions", "summary"))
+    sessions, summary = (read(tables / study / f"{name}.csv") for name in ("sessions", "summary"))
     of = {
         (arm, name): [
             one
@@ -433,26 +530,31 @@ def fleet(tables: Path) -> Iterator[str]:
             if (one["arm"], one["experiment"], one["map"]) == (arm, "7", name)
             and one["fold"] != "all"
         ]
-        for arm in "AB"
+        for arm in arms
         for name in ("single", "4 groups")
     }
-    yield "| [G16] | paper | Γ(distance) | `recall` |"
-    yield "| --- | --- | --- | --- |"
+    yield f"| [G16] | paper | {' | '.join(arms.values())} |"
+    yield f"| --- | --- |{' --- |' * len(arms)}"
     for what, column, paper in (
         ("four groups and merges ÷ one agent, time", "counted_s", "29.4 %"),
         ("the same, nodes", "nodes", "67.6 %"),
     ):
         total = {key: sum(float(one[column]) for one in some) for key, some in of.items()}
-        shares = (100 * total[arm, "4 groups"] / total[arm, "single"] for arm in "AB")
+        shares = (100 * total[arm, "4 groups"] / total[arm, "single"] for arm in arms)
         yield f"| {what} | {paper} | {' | '.join(f'{one:.1f} %' for one in shares)} |"
     maps = {"route missed, merged against one agent": ("7", "4 groups", "single", "22.0, 32.0 %")}
     pairs = {what: ("9", *names, "slightly worse") for what, names in _HELD_OUT.items()}
     for what, (experiment, first, second, paper) in {**maps, **pairs}.items():
         cells = (
             _points(*(sessions_of(sessions, arm, experiment, name) for name in (first, second)))
-            for arm in "AB"
+            for arm in arms
         )
         yield f"| {what} | {paper} | {' | '.join(cells)} |"
+
+
+def fleet_as_published(tables: Path) -> Iterator[str]:
+    """The same with the papers' rules and a front-end as weak as theirs."""
+    yield from fleet(tables, "fleet-as-published", {"S": "Γ(path), as published"})
 
 
 def _peers_of(tables: Path, *scenes: str) -> dict[tuple[str, str], list[Row]]:
@@ -536,6 +638,8 @@ BLOCKS: Mapping[str, Block] = {
     "real-images": Block("real-images", real_images),
     "real-images-in-short": Block("real-images", real_images_in_short),
     "robot-needs": Block("robot-needs", robot_needs),
+    "bench": Block("bench", bench),
+    "centre": Block("centre", centre),
     "eyes": Block("eyes", eyes),
     "kills": Block("kills", kills),
     "power-cuts": Block("power-cuts", power_cuts),
@@ -550,6 +654,9 @@ BLOCKS: Mapping[str, Block] = {
     "year": Block("year", year),
     "budgets": Block("budgets", lambda tables: in_short(tables / "budgets/cells.csv")),
     "fleet": Block("fleet", fleet),
+    "fleet-as-published": Block("fleet-as-published", fleet_as_published),
+    "ranking-wet": Block("ranking-wet", ranking_wet),
+    "ranking-elsewhere": Block("ranking-elsewhere", ranking_elsewhere),
     "peers": Block("peers", peers),
     "peers-on-clips": Block("peers", peers_on_clips),
 }

@@ -50,18 +50,23 @@ def read(path: Path) -> list[Row]:
         return list(csv.DictReader(file))
 
 
-def pooled(rows: Sequence[Row]) -> list[Row]:
-    """The rows of all folds but those of the path policies' variants."""
-    usual = {"rounds": "1", "T": "10", "radius": "search", "mode": "memo", "fold": "all"}
-    some = [one for one in rows if all(one[name] == value for name, value in usual.items())]
+def usual(rows: Sequence[Row]) -> list[Row]:
+    """The rows of one round, T = 10 and the settings' kind of paths, not in real time."""
+    asked = {"rounds": "1", "T": "10", "radius": "search", "mode": "memo"}
+    some = [one for one in rows if all(one[name] == value for name, value in asked.items())]
     paths = some[0]["paths"] if some else ""  # the settings' own: the first configuration is plain
     return [one for one in some if one["paths"] == paths]
 
 
-def missed(rows: Sequence[Row]) -> Interval:
-    """Route not localised over sessions, per cent, with its interval."""
+def pooled(rows: Sequence[Row]) -> list[Row]:
+    """The rows of all folds but those of the path policies' variants."""
+    return usual([one for one in rows if one["fold"] == "all"])
+
+
+def share_of(rows: Sequence[Row], name: str) -> Interval:
+    """A share of the route over sessions, per cent, with its interval."""
     driven_m = np.array([float(one["driven_m"]) for one in rows])
-    share = np.array([float(one["share_not_localised"]) for one in rows])
+    share = np.array([float(one[name]) for one in rows])
     found = Resamples.of(len(rows)).interval(SessionSums(share * driven_m, driven_m))
     return Interval(100 * found.estimate, 100 * found.low, 100 * found.high)
 
@@ -157,7 +162,9 @@ def _compared(rows: Sequence[Row], experiment: str, maps: Mapping[str, str]) -> 
         own = {name: sessions_of(rows, arm, experiment, name) for name in maps}
         common = set.intersection(*({one["drive"] for one in each} for each in own.values()))
         for place, name in enumerate(maps):
-            found = missed([one for one in own[name] if one["drive"] in common])
+            found = share_of(
+                [one for one in own[name] if one["drive"] in common], "share_not_localised"
+            )
             bars(axes, place + 0.4 * side - 0.2, found, PALETTE[side])
         axes.bar(0, 0, color=PALETTE[side], label=label)
     axes.set_xticks(range(len(maps)), maps.values())

@@ -507,6 +507,13 @@ def _beside_others(campaign: CampaignResult, result: ConfigurationResult) -> Row
 
 # Names of simulated drives say the weather; a road is wet in these.
 _WET = re.compile(r"-(rain|showers|damp|thaw)-")
+
+
+def is_wet(drive: str) -> bool:
+    """Whether a simulated drive's road is wet, by its name."""
+    return bool(_WET.search(drive))
+
+
 _MEASURES = {
     "policy": "policy",
     "drives": "drives",
@@ -518,8 +525,8 @@ _MEASURES = {
 def measure_rows(campaign: CampaignResult) -> list[Row]:
     """Every estimator of P(> 10 m) at the few lanes, on dry and on wet roads apart."""
     kinds: list[tuple[str, Callable[[SessionResult], bool]]] = [
-        ("dry", lambda one: not _WET.search(one.name)),
-        ("wet", lambda one: bool(_WET.search(one.name))),
+        ("dry", lambda one: not is_wet(one.name)),
+        ("wet", lambda one: is_wet(one.name)),
     ]
     rows = []
     for policy in campaign.policies:
