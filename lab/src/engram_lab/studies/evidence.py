@@ -110,7 +110,7 @@ STUDIES: Mapping[str, Study] = {
     ),
     "bench": Study(
         ("engram lab bench --json",),
-        10,
+        2,
         ("1.txt",),
         ("docs/evidence.md", "lab/reports/performance.md"),
         town=False,
@@ -352,13 +352,12 @@ STUDIES: Mapping[str, Study] = {
         resumes=True,
     ),
     "centre": Study(
-        tuple(
-            f"{_CHECKS}centre_load --agents 50 --nodes {nodes} --minutes 10 "
-            f"--json {{out}}/{nodes}.json"
-            for nodes in (2000, 20000)
+        (
+            f"{_CHECKS}centre_load --agents 50 --nodes 20000 --minutes 10 "
+            "--json {out}/figures.json",
         ),
-        25,
-        ("2000.json", "20000.json"),
+        12,
+        ("figures.json",),
         ("docs/centre.md",),
         town=False,
     ),
