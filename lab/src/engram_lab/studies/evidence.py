@@ -112,7 +112,7 @@ STUDIES: Mapping[str, Study] = {
         ("engram lab bench --json",),
         2,
         ("1.txt",),
-        ("docs/evidence.md", "lab/reports/performance.md"),
+        ("docs/evidence.md",),
         town=False,
     ),
     # Towns that no setting and no constant was chosen on.
