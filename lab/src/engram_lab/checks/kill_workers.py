@@ -154,9 +154,10 @@ def _admit_here(
     path: Path,
     memory_bytes: int,
     time_s: int,
+    begun: merge_job.Checker | None = None,
 ) -> None:
     """`merge_job.admit` without a process of its own."""
-    del memory_bytes, time_s
+    del memory_bytes, time_s, begun
     merge_job.write_checked(manifest, parts, path)
 
 

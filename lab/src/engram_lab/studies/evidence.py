@@ -353,7 +353,7 @@ STUDIES: Mapping[str, Study] = {
     ),
     "centre": Study(
         (
-            f"{_CHECKS}centre_load --agents 50 --nodes 20000 --minutes 10 "
+            f"{_CHECKS}centre_load --agents 50 --nodes 20000 --minutes 10 --forays 6 "
             "--json {out}/figures.json",
         ),
         12,

@@ -22,11 +22,14 @@ import resource
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
+from multiprocessing.context import ForkContext, ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Literal
 
 from engram.counts import counted
 from engram.errors import (
@@ -62,8 +65,45 @@ class KilledError(WorkerError):
     """Something killed the process that checks a map."""
 
 
+@dataclass(frozen=True, slots=True)
+class Checker:
+    """A process that waits for one map to check, and the pipe to it."""
+
+    process: BaseProcess
+    pipe: Connection
+
+
+@contextmanager
+def checker(method: Literal["fork", "forkserver"]) -> Iterator[Checker]:
+    """Begins the process that checks one map; it ends with the block.
+
+    Args:
+        method: `fork` where this process is new and holds nothing of the centre yet: a child of a
+            fork server does not reach that server, and would start another one, for a second.
+    """
+    context: ForkContext | ForkServerContext = multiprocessing.get_context("fork")
+    if method == "forkserver":
+        context = multiprocessing.get_context(method)
+        context.set_forkserver_preload([__name__])
+    pipe, theirs = context.Pipe()
+    process: BaseProcess = context.Process(target=_admit_confined, args=(theirs, pipe), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        yield Checker(process, pipe)
+    finally:
+        pipe.close()
+        process.kill()
+        process.join()
+
+
 def admit(
-    manifest: Manifest, parts: dict[PartHash, bytes], path: Path, memory_bytes: int, time_s: int
+    manifest: Manifest,
+    parts: dict[PartHash, bytes],
+    path: Path,
+    memory_bytes: int,
+    time_s: int,
+    begun: Checker | None = None,
 ) -> None:
     """Writes the thin map of a hand-in and checks it.
 
@@ -73,6 +113,7 @@ def admit(
         path: the file to write.
         memory_bytes: that the process may take, beyond what the parts take.
         time_s: processor time that it may take.
+        begun: the process, if it was begun before; it checks no other map.
 
     Raises:
         MapCorruptError: the parts make no sound map.
@@ -80,47 +121,46 @@ def admit(
         KilledError: something else than the limits ended the process.
         WorkerError: the limits ended it.
     """
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])
-    pipe, theirs = context.Pipe()
     size = sum(map(len, parts.values()))
     limits = (memory_bytes + 3 * size, time_s, 3 * size + 2**26)
-    process = context.Process(target=_admit_confined, args=(theirs, limits), daemon=True)
-    process.start()
-    theirs.close()
-    try:
-        pipe.send((manifest, parts, path))
-        outcome = pipe.recv()
-    except (EOFError, OSError):
-        process.join()
-        if process.exitcode == -signal.SIGKILL:  # limits end it in other ways
-            raise KilledError(
-                "the check of the map was killed, as by a system that is out of memory"
+    with checker("forkserver") if begun is None else nullcontext(begun) as asked:
+        try:
+            asked.pipe.send((manifest, parts, path, limits))
+            outcome = asked.pipe.recv()
+        except (EOFError, OSError):
+            asked.process.join()
+            code = asked.process.exitcode
+            if code == -signal.SIGKILL:  # limits end it in other ways
+                raise KilledError(
+                    "the check of the map was killed, as by a system that is out of memory"
+                ) from None
+            raise WorkerError(
+                f"the map took more than {memory_bytes} bytes or {time_s} s to check, exit code "
+                f"{code}"
             ) from None
-        raise WorkerError(
-            f"the map took more than {memory_bytes} bytes or {time_s} s to check, exit code "
-            f"{process.exitcode}"
-        ) from None
-    finally:
-        pipe.close()
-    process.join()
     if isinstance(outcome, EngramError):
         raise outcome
 
 
-def _admit_confined(pipe: Connection, limits: tuple[int, int, int]) -> None:
-    """Main function of the process."""
+def _admit_confined(pipe: Connection, theirs: Connection) -> None:
+    """Main function of the process; it ends if nothing comes through the pipe."""
     end_with_parent()
-    manifest, parts, path = pipe.recv()
-    confine(*limits)
-    outcome: EngramError | None = None
+    theirs.close()
+    with suppress(EOFError):
+        manifest, parts, path, limits = pipe.recv()
+        confine(*limits)
+        pipe.send(_checked(manifest, parts, path))
+
+
+def _checked(manifest: Manifest, parts: dict[PartHash, bytes], path: Path) -> EngramError | None:
+    """What `write_checked` raised."""
     try:
         write_checked(manifest, parts, path)
     except StorageFullError as error:
-        outcome = error
+        return error
     except EngramError as error:
-        outcome = MapCorruptError(str(error))
-    pipe.send(outcome)
+        return MapCorruptError(str(error))
+    return None
 
 
 def write_checked(manifest: Manifest, parts: dict[PartHash, bytes], path: Path) -> None:
@@ -199,8 +239,11 @@ class WaitsError(EngramError):
     """A hand-in waits for the centre."""
 
 
-def merge_hand_in(centre: Centre, row: HandIn) -> None:
+def merge_hand_in(centre: Centre, row: HandIn, begun: Checker | None = None) -> None:
     """Merges one complete hand-in.
+
+    Args:
+        begun: the process that checks it, if it was begun before.
 
     Raises:
         EngramError: what lies with the centre, and not with the hand-in, which waits: no space, a
@@ -218,7 +261,7 @@ def merge_hand_in(centre: Centre, row: HandIn) -> None:
         with _scratch(thin):
             policy, manifest = centre.policy(row.map), handins.manifest_of(centre, row)
             parts, limits = handins.parts_to_merge(centre, row, manifest), centre.settings
-            admit(manifest, parts, thin, limits.admission_bytes, limits.admission_s)
+            admit(manifest, parts, thin, limits.admission_bytes, limits.admission_s, begun)
             (report,) = merge(
                 centre.map_path(row.map),
                 [thin],
@@ -357,8 +400,12 @@ def _merge(
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the worker ends it
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO)
-    with logging_to_stderr(), Centre(folder, *addresses, settings) as centre:
+    with (
+        logging_to_stderr(),
+        checker("fork") as begun,
+        Centre(folder, *addresses, settings) as centre,
+    ):
         try:
-            merge_hand_in(centre, jobs.get(centre, HandIn, key))
+            merge_hand_in(centre, jobs.get(centre, HandIn, key), begun)
         except (EngramError, OSError) as error:
             pipe.send(centre.words_of(error))
