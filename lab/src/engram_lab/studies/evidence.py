@@ -353,10 +353,10 @@ STUDIES: Mapping[str, Study] = {
     ),
     "centre": Study(
         (
-            f"{_CHECKS}centre_load --agents 50 --nodes 20000 --minutes 10 --forays 6 "
+            f"{_CHECKS}centre_load --agents 50 --nodes 20000 --minutes 6 --forays 4 "
             "--json {out}/figures.json",
         ),
-        12,
+        8,
         ("figures.json",),
         ("docs/centre.md",),
         town=False,
