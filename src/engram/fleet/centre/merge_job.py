@@ -26,7 +26,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
-from multiprocessing.context import ForkContext, ForkServerContext
+from multiprocessing.context import ForkServerContext
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Literal
@@ -65,6 +65,23 @@ class KilledError(WorkerError):
     """Something killed the process that checks a map."""
 
 
+# What its children need; of SciPy, what merging imports only where it is used.
+_PRELOADED = [
+    __name__,
+    "scipy.cluster.hierarchy",
+    "scipy.sparse.csgraph",
+    "scipy.sparse.linalg",
+    "scipy.spatial.transform",
+]
+
+
+def _fork_server() -> ForkServerContext:
+    """That of this process."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(_PRELOADED)
+    return context
+
+
 @dataclass(frozen=True, slots=True)
 class Checker:
     """A process that waits for one map to check, and the pipe to it."""
@@ -81,10 +98,7 @@ def checker(method: Literal["fork", "forkserver"]) -> Iterator[Checker]:
         method: `fork` where this process is new and holds nothing of the centre yet: a child of a
             fork server does not reach that server, and would start another one, for a second.
     """
-    context: ForkContext | ForkServerContext = multiprocessing.get_context("fork")
-    if method == "forkserver":
-        context = multiprocessing.get_context(method)
-        context.set_forkserver_preload([__name__])
+    context = multiprocessing.get_context(method) if method == "fork" else _fork_server()
     pipe, theirs = context.Pipe()
     process: BaseProcess = context.Process(target=_admit_confined, args=(theirs, pipe), daemon=True)
     process.start()
@@ -353,8 +367,7 @@ def merge_apart(centre: Centre, row: HandIn) -> None:
     Raises:
         WaitsError: it waits for the centre.
     """
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])
+    context = _fork_server()
     pipe, theirs = context.Pipe(duplex=False)
     given = (theirs, centre.folder, centre.addresses, centre.settings, row.id)
     process = context.Process(target=_merge, args=given)
