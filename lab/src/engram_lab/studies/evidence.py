@@ -163,19 +163,21 @@ STUDIES: Mapping[str, Study] = {
         campaigns=("wet",),
         resumes=True,
     ),
-    "ranking-elsewhere": Study(
-        (
-            "engram lab simulate keble",
-            "engram lab simulate oxford",
-            f"{_EVALUATE}ranking keble oxford --policies {_POLICIES} {_SWEPT} --only-folds 0,4 "
-            "--relocaliser truth --out {out}",
-        ),
-        90,
-        _STUDIED,
-        ("lab/reports/ranking-elsewhere.md",),
-        campaigns=("keble", "oxford"),
-        resumes=True,
-    ),
+    **{
+        f"ranking-{campaign}": Study(
+            (
+                f"engram lab simulate {campaign}",
+                f"{_EVALUATE}ranking {campaign} --policies {_POLICIES} {_SWEPT} "
+                "--only-folds 0,4 --relocaliser truth --out {out}",
+            ),
+            40,
+            _STUDIED,
+            ("lab/reports/ranking-elsewhere.md",),
+            campaigns=(campaign,),
+            resumes=True,
+        )
+        for campaign in ("keble", "oxford")
+    },
     "ranking-whole": Study(
         (
             "engram lab simulate begbroke24h",

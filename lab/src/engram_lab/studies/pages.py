@@ -388,15 +388,14 @@ def ranking_wet(tables: Path) -> Iterator[str]:
     )
 
 
-def ranking_elsewhere(tables: Path) -> Iterator[str]:
-    """By campaign: a bicycle's, and one in both directions behind traffic."""
-    rows = usual(read(tables / "ranking-elsewhere/sessions.csv"))
-    yield from _ranked(
-        {
-            f"of `{name}`": [one for one in rows if one["campaign"].split()[0] == name]
-            for name in ("keble", "oxford")
-        }
-    )
+def ranking_keble(tables: Path) -> Iterator[str]:
+    """By bicycle through crowds."""
+    yield from _ranked({"by bicycle": usual(read(tables / "ranking-keble/sessions.csv"))})
+
+
+def ranking_oxford(tables: Path) -> Iterator[str]:
+    """In both directions, behind traffic."""
+    yield from _ranked({"in traffic": usual(read(tables / "ranking-oxford/sessions.csv"))})
 
 
 def starved(tables: Path) -> Iterator[str]:
@@ -649,7 +648,8 @@ BLOCKS: Mapping[str, Block] = {
     "fleet": Block("fleet", fleet),
     "fleet-as-published": Block("fleet-as-published", fleet_as_published),
     "ranking-wet": Block("ranking-wet", ranking_wet),
-    "ranking-elsewhere": Block("ranking-elsewhere", ranking_elsewhere),
+    "ranking-keble": Block("ranking-keble", ranking_keble),
+    "ranking-oxford": Block("ranking-oxford", ranking_oxford),
     "peers": Block("peers", peers),
     "peers-on-clips": Block("peers", peers_on_clips),
 }
