@@ -233,7 +233,7 @@ STUDIES: Mapping[str, Study] = {
         ),
         30,
         _STUDIED,
-        ("lab/reports/fleet.md",),
+        ("lab/reports/fleet-as-published.md",),
         campaigns=("begbroke24h",),
         resumes=True,
     ),
