@@ -86,3 +86,24 @@ def test_a_node_that_cannot_be_read_shows_nothing() -> None:
     node = flat_graph(2).node(1).id
     assert words.of_node(node) is None
     assert likenesses(words, np.array([3], np.int32), [node]).tolist() == [0.0]
+
+
+class _Counted(_Unreadable):
+    """The same, with the nodes whose frames were read."""
+
+    def __init__(self) -> None:
+        self.read: list[NodeId] = []
+
+    def frame(self, node: NodeId) -> Frame:
+        self.read.append(node)
+        return super().frame(node)
+
+
+def test_only_the_words_of_the_last_nodes_are_kept(monkeypatch) -> None:
+    monkeypatch.setattr("engram.places.words._REMEMBERED", 2)
+    frames = _Counted()
+    words = NodeWords(frames, lambda: default_vocabulary(BRIEF))
+    first, second, third = (flat_graph(3).node(number).id for number in range(3))
+    for node in (first, second, third, second, third, first):
+        words.of_node(node)
+    assert frames.read == [first, second, third, first]

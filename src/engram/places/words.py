@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from threading import Lock
 
@@ -33,6 +33,8 @@ Words = NDArray[np.int32]
 
 # Nodes written in one transaction: about 1 MB.
 _BATCH = 1000
+# Nodes whose words are kept: about 11 MB.
+_REMEMBERED = 4096
 
 
 def vocabulary_of(opened: Map) -> Vocabulary | None:
@@ -76,7 +78,8 @@ def words_of(opened: Map, descriptor: DescriptorKind) -> NodeWords:
 class NodeWords:
     """The distinct words, increasing, of nodes and live frames by one vocabulary.
 
-    Words stored in the map are read from it; others are computed from landmarks, once.
+    Words stored in the map are read from it; others are computed from landmarks. Those of the last
+    nodes asked for are kept.
 
     Args:
         vocabulary: gives the vocabulary; called once, at first use.
@@ -92,7 +95,7 @@ class NodeWords:
         self._frames = frames
         self._give_vocabulary = vocabulary
         self._store = store
-        self._known: dict[NodeId, Words | None] = {}
+        self._recalled = lru_cache(_REMEMBERED)(self._words_now)
         # The live frame's words: several localisers of one drive ask for them in turn.
         self._last: tuple[Frame, Words] | None = None
 
@@ -143,10 +146,11 @@ class NodeWords:
 
         ``engram check`` reports such a node, and reading its landmarks raises.
         """
-        if node not in self._known:
-            words = self.stored([node]).get(node)
-            self._known[node] = self._work_out(node) if words is None else words
-        return self._known[node]
+        return self._recalled(node)
+
+    def _words_now(self, node: NodeId) -> Words | None:
+        words = self.stored([node]).get(node)
+        return self._work_out(node) if words is None else words
 
     def keep_missing(
         self,
