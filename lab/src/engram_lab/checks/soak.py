@@ -8,9 +8,9 @@ fresh robot takes the same frames, in blocks that alternate with those of the ol
 
 Logged: the first eight frame logs of folder HOME, drives of one town, become a map as usual. All
 others are added by robots that cannot relocalise, which save all they see, until the map has so
-many nodes; then it is not changed any more. The third log of HOME is driven there and back, at two
-attempts a frame, and its old robot is compared with a fresh one as above. With `--maps` both map,
-each in a copy of that map.
+many nodes; then it is not changed any more. A log of HOME, the third unless `--drive` names another
+one, is driven there and back, at two attempts a frame, and its old robot is compared with a fresh
+one as above. With `--maps` both map, each in a copy of that map.
 
 Ratios are of processor time, all threads of the process: medians over blocks, with quartiles.
 """
@@ -46,7 +46,8 @@ _BLOCKS = 16  # of each robot
 _WARM = 100  # frames of a fresh robot before it is timed
 _SETTLED = 5_000  # frames of the old one before its memory counts: it has read all of its lap
 _AT_HOME = 8  # logs of the town whose map is used
-_REPORTED = 50_000  # frames between two reports of memory
+_LAP = 2  # of these, that which is driven
+_REPORTED = 5_000  # frames between two reports of memory
 
 
 def localising(frames: int) -> Iterator[Figure]:
@@ -97,9 +98,22 @@ def aged(
 
 
 def logged(
-    frames: int, nodes: int, home: Path, others: Sequence[Path], *, maps: bool = False
+    frames: int,
+    nodes: int,
+    home: Path,
+    others: Sequence[Path],
+    *,
+    lap: int = _LAP,
+    maps: bool = False,
+    memory_bytes: int | None = None,
 ) -> Iterator[Figure]:
-    """The same from frame logs, in a map of so many nodes; `maps` says whether robots map, too."""
+    """The same from frame logs, in a map of so many nodes.
+
+    Args:
+        lap: number of the log that is driven.
+        maps: whether robots map, too.
+        memory_bytes: their limit.
+    """
     logs = sorted(home.glob("*.framelog"))
     with tempfile.TemporaryDirectory(prefix="engram-soak-") as folder:
         path = Path(folder) / "fixed.engram"
@@ -111,16 +125,16 @@ def logged(
                 if len(opened.graph) >= nodes:
                     break
             map_drive(path, open_drive(log), Settings(), RobotOptions(relocaliser=None))
-        entries = [one for one in open_drive(logs[2]) if isinstance(one, LoggedFrame)]
+        entries = [one for one in open_drive(logs[lap]) if isinstance(one, LoggedFrame)]
         with Map.open(path) as opened:
             yield Figure("nodes of the map", len(opened.graph))
             camera = entries[0].frame.camera
-            robot = partial(opened.robot, camera, lanes=1, rounds=2)
-            mapper = partial(_mapper, path, camera)
+            robot = partial(opened.robot, camera, lanes=1, rounds=2, memory_bytes=memory_bytes)
+            mapper = partial(_mapper, path, camera, memory_bytes)
             yield from aged(mapper if maps else robot, there_and_back(entries), frames)
             with robot() as judge:
-                lap = map(judge.step, map(there_and_back(entries), range(2 * len(entries) - 2)))
-                share = statistics.mean(one.localised for one in lap)
+                seen = map(judge.step, map(there_and_back(entries), range(2 * len(entries) - 2)))
+                share = statistics.mean(one.localised for one in seen)
             yield Figure("share of a lap's frames localised", share)
 
 
@@ -130,12 +144,14 @@ def _copied(path: Path, folder: Path) -> Path:
 
 
 @contextmanager
-def _mapper(path: Path, camera: StereoCamera) -> Iterator[Robot]:
+def _mapper(path: Path, camera: StereoCamera, memory_bytes: int | None) -> Iterator[Robot]:
     """A robot that maps in a copy of a map."""
     with (
         tempfile.TemporaryDirectory(dir=path.parent) as folder,
         open_map(_copied(path, Path(folder))) as opened,
-        opened.robot(camera, lanes=1, rounds=2, name="mapper", maps=True) as robot,
+        opened.robot(
+            camera, lanes=1, rounds=2, name="mapper", maps=True, memory_bytes=memory_bytes
+        ) as robot,
     ):
         yield robot
 
@@ -204,12 +220,22 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=7000)
     parser.add_argument("--nodes", type=int, default=4_000)
     parser.add_argument("--maps", action="store_true", help="logged: the robots map, too")
+    parser.add_argument("--drive", type=int, default=_LAP, help="logged: which log of HOME, from 0")
+    parser.add_argument("--memory", type=int, help="logged: the robots' limit, MB")
     given = parser.parse_args()
     if given.what == "localising":
         figures = localising(given.frames)
     elif given.logs:
         home, *others = given.logs
-        figures = logged(given.frames, given.nodes, home, others, maps=given.maps)
+        figures = logged(
+            given.frames,
+            given.nodes,
+            home,
+            others,
+            lap=given.drive,
+            maps=given.maps,
+            memory_bytes=given.memory and given.memory * 10**6,
+        )
     else:
         parser.error("logged: name folders by --logs")
     report(figures, given.json, given.what)
