@@ -79,7 +79,7 @@ class NodeWords:
     """The distinct words, increasing, of nodes and live frames by one vocabulary.
 
     Words stored in the map are read from it; others are computed from landmarks. Those of the last
-    nodes asked for are kept.
+    requested nodes are kept.
 
     Args:
         vocabulary: gives the vocabulary; called once, at first use.
