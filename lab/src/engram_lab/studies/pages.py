@@ -393,11 +393,6 @@ def ranking_keble(tables: Path) -> Iterator[str]:
     yield from _ranked({"by bicycle": usual(read(tables / "ranking-keble/sessions.csv"))})
 
 
-def ranking_oxford(tables: Path) -> Iterator[str]:
-    """In both directions, behind traffic."""
-    yield from _ranked({"in traffic": usual(read(tables / "ranking-oxford/sessions.csv"))})
-
-
 def starved(tables: Path) -> Iterator[str]:
     """The same with a front-end as weak as the paper's, and how fast its maps grow."""
     yield from ranking(tables, "starved")
@@ -649,7 +644,6 @@ BLOCKS: Mapping[str, Block] = {
     "fleet-as-published": Block("fleet-as-published", fleet_as_published),
     "ranking-wet": Block("ranking-wet", ranking_wet),
     "ranking-keble": Block("ranking-keble", ranking_keble),
-    "ranking-oxford": Block("ranking-oxford", ranking_oxford),
     "peers": Block("peers", peers),
     "peers-on-clips": Block("peers", peers_on_clips),
 }
