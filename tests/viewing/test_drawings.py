@@ -145,7 +145,7 @@ def _places(arrows: list[tuple[np.ndarray, float]]) -> list[tuple[float, ...]]:
 
 def test_nodes_that_are_one_dot_are_drawn_once() -> None:
     lap_m = np.column_stack([np.arange(0.0, 1000.0, 10.0), np.zeros(100)])
-    laps = [lap_m + [0.0, 1e-3 * number] for number in range(30)]
+    laps = [lap_m + np.array([0.0, 1e-3 * number]) for number in range(30)]
     figure = draw_parts([Panel("city", [Track("monday", np.concatenate(laps))])])
     drawn = figure.axes[0].lines[0].get_xydata()
     np.testing.assert_array_equal(drawn, lap_m)
