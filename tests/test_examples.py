@@ -13,6 +13,7 @@ import pytest
 from tests.test_docs import Block, blocks, run_words
 
 from engram import plugins
+from engram.frontend import features
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
@@ -59,6 +60,8 @@ def test_the_commands_that_are_shown_run(
     installed: Path, street: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(installed))
+    # Kinds that were loaded stay in the table; other tests must not meet those of the examples.
+    monkeypatch.setattr(features, "FEATURES", dict(features.FEATURES))
     plugins._installed.cache_clear()
     monkeypatch.chdir(tmp_path)
     (tmp_path / "street").symlink_to(street)
