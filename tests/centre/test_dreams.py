@@ -262,7 +262,7 @@ def test_a_better_order_becomes_a_revision_and_a_hand_in_interrupts(tmp_path, to
     row = dreams.ask(site.centre, NAME, "tests")
     asked = iter([False, True])
     with monkeypatch.context() as patch:
-        patch.setattr(worker, "_is_asked_for", lambda _: next(asked))
+        patch.setattr(worker, "_is_needed", lambda _: next(asked))
         assert dream_a_while(site.centre, time.sleep, lambda: False)
     assert jobs.get(site.centre, Dream, row.id).state == "asked"
     assert nodes_of(site.centre.map_path(NAME)) == before
