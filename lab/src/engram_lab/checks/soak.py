@@ -47,7 +47,7 @@ _WARM = 100  # frames of a fresh robot before it is timed
 _SETTLED = 5_000  # frames of the old one before its memory counts: it has read all of its lap
 _AT_HOME = 8  # logs of the town whose map is used
 _LAP = 2  # of these, that which is driven
-_REPORTED = 5_000  # frames between two reports of memory
+_REPORTS = 20  # of memory, at most, each after at least so many frames as settle it
 
 
 def localising(frames: int) -> Iterator[Figure]:
@@ -80,8 +80,9 @@ def aged(
     with robot() as old:
         drive(old, frame_at, range(settled))
         before_mb = resident_mb()
-        for first in range(settled, frames, _REPORTED):
-            until = min(first + _REPORTED, frames)
+        apart = max(_SETTLED, frames // _REPORTS)
+        for first in range(settled, frames, apart):
+            until = min(first + apart, frames)
             drive(old, frame_at, range(first, until))
             grown_mb = resident_mb() - before_mb
             yield Figure(f"memory, frames {settled:,} to {until:,}", grown_mb, "MB")

@@ -160,10 +160,12 @@ def _admit_confined(pipe: Connection, theirs: Connection) -> None:
     """Main function of the process; it ends if nothing comes through the pipe."""
     end_with_parent()
     theirs.close()
-    with suppress(EOFError):
+    try:
         manifest, parts, path, limits = pipe.recv()
-        confine(*limits)
-        pipe.send(_checked(manifest, parts, path))
+    except EOFError:
+        return
+    confine(*limits)
+    pipe.send(_checked(manifest, parts, path))
 
 
 def _checked(manifest: Manifest, parts: dict[PartHash, bytes], path: Path) -> EngramError | None:
