@@ -529,11 +529,10 @@ def faults(
 ) -> None:
     """Inject faults into drives; count false fixes.
 
-    Localises clips (python -m engram_lab.studies.faults.clips renders them; ENGRAM_DATA names
-    real ones) in maps of other days, and adds them to these maps. The same command resumes a run
-    that was stopped; each version of the method has a file of its own. --only also takes
-    questions: misplaced robots, merged maps, differently mounted cameras, and others. An
-    unknown name lists the questions.
+    Localises clips (rendered once; ENGRAM_DATA names real ones) in maps of other days, and adds
+    them to these maps. The same command resumes a run that was stopped; each version of the
+    method has a file of its own. --only also takes questions: misplaced robots, merged maps,
+    differently mounted cameras, and others. An unknown name lists the questions.
 
     \b
     Examples:
@@ -601,14 +600,16 @@ def _inject(
     from platformdirs import user_cache_path
 
     from engram.cli.screen import Bars
+    from engram_lab.studies.faults.clips import JUDGING, REVERSED, render
     from engram_lab.studies.faults.staging import default_file, fault_of, read_trials
     from engram_lab.studies.faults.study import headline, page, run
 
     file = work or default_file(user_cache_path("engram") / "faults")
     if not report_only:
+        render([*JUDGING, *REVERSED], bars := Bars())
         wanted = [number for number in range(trials) if fault_of(number) in names]
         made = {one.number for one in read_trials(file)}
-        with Bars().stage("faults", len(set(wanted) - made)) as monitor:
+        with bars.stage("faults", len(set(wanted) - made)) as monitor:
             for _ in run(file, trials, monitor=monitor, only=names):
                 pass
     found = [one for one in read_trials(file) if one.fault in names]

@@ -19,11 +19,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from engram.cli.screen import Bars
 from engram.frontend.frame import StereoPair
 from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram.graph.model import Clock
-from engram.monitor import write_whole
+from engram.monitor import QUIET, Monitor, write_whole
 from engram.sequences.sequence import SequenceInfo
 from engram_lab.town.campaigns import WORLD_VERSION, SessionPlan, campaign_named
 from engram_lab.town.drive import ROBOTS, Robot
@@ -218,15 +219,25 @@ def missing(plans: list[ClipPlan]) -> Iterator[ClipPlan]:
     return (plan for plan in plans if not plan.path().exists())
 
 
+def render(plans: list[ClipPlan], monitor: Monitor = QUIET) -> None:
+    """Renders those that are not in the cache."""
+    left = list(missing(plans))
+    if not left:
+        return
+    with monitor.stage("clips", len(left)) as part:
+        for plan in left:
+            _render(plan, plan.path())
+            part.advance(plan.name)
+            part.check()
+
+
 def main() -> None:
-    """Renders what is missing, and says so."""
+    """Renders what is not in the cache, and reports it."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.parse_args()
-    for plan in missing([*SETTING, *JUDGING, *REVERSED, *DOCTORED]):
-        _render(plan, plan.path())
-        print(plan.path(), flush=True)
+    render([*SETTING, *JUDGING, *REVERSED, *DOCTORED], Bars())
 
 
 if __name__ == "__main__":

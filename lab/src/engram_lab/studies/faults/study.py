@@ -234,12 +234,12 @@ def run_trial(number: int, fault: str, scene: Scene, right: frozenset[int] = fro
     return trial
 
 
-def available() -> list[Plan]:
-    """The clips of the study: rendered ones that are in the cache, and real ones.
+def clips() -> list[Plan]:
+    """The clips of the study: rendered ones, and the real ones that ENGRAM_DATA names.
 
-    With other clips at hand a number draws another clip; trials that are made stay.
+    With other real clips a number draws another clip; trials that are made stay.
     """
-    return [*(one for one in (*JUDGING, *REVERSED) if one.path().exists()), *real_plans()]
+    return [*JUDGING, *REVERSED, *real_plans()]
 
 
 def run(
@@ -252,9 +252,9 @@ def run(
     """Makes the trials up to a number that are missing from a file of results, by place.
 
     Args:
-        plans: the clips; None for those that are `available`.
+        plans: the clips; None for `clips`. Rendered ones that the cache lacks are rendered first.
     """
-    plans, made = available() if plans is None else plans, TrialFile(file)
+    plans, made = clips() if plans is None else plans, TrialFile(file)
     wanted = [(n, drawn(n, plans)) for n in range(trials) if fault_of(n) in only]
     left = [(number, *one) for number, one in wanted if one and number not in made.numbers]
     right: dict[str, frozenset[int]] = {}
