@@ -80,8 +80,8 @@ def simulate(
         str,
         typer.Argument(
             metavar="CAMPAIGN",
-            help="hamlet, village, begbroke, keble, oxford, begbroke24h, year, wet, covered or "
-            "estate.",
+            help="hamlet, village, begbroke, keble, oxford, begbroke24h, year, month, wet, "
+            "covered or estate.",
         ),
     ],
     *,

@@ -373,6 +373,28 @@ def _year(seed: int, size: Size) -> Campaign:
     return Campaign("year", seed, 200, False, sessions, 0.4, size, "year")
 
 
+# Drives of the month on each day, and of these by the robot with the other camera.
+MONTH_ROBOTS, _COURIERS = 10, 3
+
+
+def _month(seed: int, size: Size) -> Campaign:
+    """Ten robots, each once a day for thirty days, round a hamlet; it rains as in Oxford."""
+    count = 30 * MONTH_ROBOTS
+    rng = np.random.default_rng([seed, 0x30D])
+    first = datetime(2025, 9, 1, tzinfo=UTC)
+    minutes = (np.arange(count) + 0.5) * 24 * 60 / MONTH_ROBOTS + rng.uniform(-60, 60, count)
+    starts = [first + timedelta(minutes=round(float(m))) for m in minutes]
+    # Each day deals the robots to the hours in another order.
+    robots = [
+        "courier" if one < _COURIERS else "wildcat"
+        for _ in range(30)
+        for one in rng.permutation(MONTH_ROBOTS)
+    ]
+    plans = _planned("month", seed, starts, _dealt(rng, count), robots, [False] * count)
+    sessions = _under(Rainfall(seed), plans)
+    return Campaign("month", seed, 150, False, sessions, 0.4, size, "month")
+
+
 def _wet(seed: int, size: Size) -> Campaign:
     """A stress, never averaged with months: three of four drives in rain of 1 mm/h on.
 
@@ -454,6 +476,7 @@ CAMPAIGNS: dict[str, Callable[[int, Size], Campaign]] = {
     "begbroke24h": _begbroke24h,
     "estate": estate,
     "year": _year,
+    "month": _month,
     "wet": _wet,
     "covered": _covered,
 }
