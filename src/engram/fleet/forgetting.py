@@ -96,8 +96,7 @@ class Retention:
     ) -> frozenset[NodeId]:
         """Nodes that go so that the rest takes `down_to`; see `serving_order`."""
         stock, (most_bytes, percent) = Stock(store), self.down_to
-        landmarks, pictures = stock.sizes
-        sizes = landmarks + pictures + _NODE_BYTES
+        sizes = node_bytes(stock)
         of_bytes = int(sizes.sum())
         if percent is not None:
             most_bytes = int(of_bytes * percent / 100)
@@ -105,7 +104,7 @@ class Retention:
         if of_bytes <= most_bytes:
             return frozenset()
         if self.pictures:
-            sizes = pictures
+            _, sizes = stock.sizes
         may_go = np.array(
             [
                 node.session in drives and (inside is None or node.id in inside)
@@ -124,6 +123,12 @@ class Retention:
         return frozenset(stock.node_ids[at] for at in going[:count].tolist())
 
 
+def node_bytes(stock: Stock) -> NDArray[np.int64]:
+    """(N,) what each node takes in a map's file, about: landmarks, picture and rows."""
+    landmarks, pictures = stock.sizes
+    return landmarks + pictures + _NODE_BYTES
+
+
 def serving_order(stock: Stock) -> NDArray[np.int64]:
     """(N,) all nodes, those that serve most first.
 
@@ -131,9 +136,7 @@ def serving_order(stock: Stock) -> NDArray[np.int64]:
     of kind `budget` without an hour takes first. Of nodes that spare none, newer drives come first.
     """
     coverage = coverage_for(stock, DownloadOptions(select="budget"))
-    landmarks, pictures = stock.sizes
-    sizes = (landmarks + pictures + _NODE_BYTES).astype(np.float64)
-    return greedy_order(coverage, sizes, np.arange(len(stock))[::-1])
+    return greedy_order(coverage, node_bytes(stock).astype(np.float64), np.arange(len(stock))[::-1])
 
 
 def _within(

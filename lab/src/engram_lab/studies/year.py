@@ -35,7 +35,7 @@ from engram_lab.studies.drives import EvaluatedDrive, open_campaign
 from engram_lab.studies.plan import Row, table, write_csv
 from engram_lab.town.simulating import campaigns_folder
 
-_FAR_M = 10.0
+FAR_M = 10.0
 # From this drive on growth is judged: three months.
 _SETTLED = 13
 
@@ -142,19 +142,20 @@ class Year:
 
 def _row(arm: str, drive: EvaluatedDrive, report: MapReport) -> Row:
     seen = measured(report.results)
-    far_m, driven_m = failure_sums(seen, np.array([_FAR_M]))
+    far_m, driven_m = failure_sums(seen, np.array([FAR_M]))
     return {
         "arm": arm,
         "drive": drive.name,
         "driven_m": float(driven_m),
         "far_m": float(far_m[0]),
-        "share_not_localised": _missed(seen),
+        "share_not_localised": missed(seen),
         "saved": report.saved,
         "forgotten": 0,
     }
 
 
-def _missed(drive: Drive) -> float:
+def missed(drive: Drive) -> float:
+    """Share of a drive's route that was not localised."""
     return float(route_not_localised([drive]))
 
 
