@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+
 import pytest
 
 from engram.errors import MapLockedError
-from engram.fleet.forgetting import Retention, forget
+from engram.fleet.centre.tables import Event, audit
+from engram.fleet.centre.worker import keep_to_cap, sweep_all
+from engram.fleet.download.part import Stock
+from engram.fleet.forgetting import Retention, forget, node_bytes
 from engram.maps.forgetting import erase_map
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
@@ -48,3 +54,36 @@ def test_a_forgotten_drive_comes_back_from_no_robot(site: Site) -> None:
     site.settle()
     assert starts_in(centre) == {2_000}
     assert check_file(centre).problems == ()
+
+
+def test_a_worker_keeps_a_map_to_its_cap_and_robots_follow(site: Site) -> None:
+    robot = site.robot("r1")
+    for start_ns in (1_000, 2_000):
+        drive(robot.live, "r1", start_ns)
+        robot.hand_in()
+        site.settle()
+    centre = site.centre
+    with Map.open(centre.map_path(NAME)) as store:
+        sizes, before = node_bytes(Stock(store)), store.revision
+    assert keep_to_cap(centre, NAME) == 0  # there is none
+    most_bytes = int(sizes.sum()) // 2
+    centre.set_policy(NAME, replace(centre.policy(NAME), cap_bytes=most_bytes), "tests")
+    sweep_all(centre)
+    with Map.open(centre.map_path(NAME)) as store:
+        left = node_bytes(Stock(store))
+        assert 0 < left.sum() <= most_bytes
+        assert left.sum() + sizes.max() > most_bytes  # and no more goes than that
+        assert store.revision == before + 1
+        forgot = next(entry for entry in store.log() if entry.number == store.revision)
+    assert (forgot.author, forgot.message) == ("worker", "forget: the map's cap")
+    (noted,) = centre.database.rows(Event, audit.c.action == "cap")
+    assert json.loads(noted.detail) == {"revision": before + 1, "nodes": len(sizes) - len(left)}
+    sweep_all(centre)  # what is within the cap stays as it is
+    with Map.open(centre.map_path(NAME)) as store:
+        assert store.revision == before + 1
+    site.settle()
+    assert robot.switch()
+    for path in (centre.map_path(NAME), robot.live):
+        with Map.open(path) as store:
+            assert store.node_count() == len(left)
+        assert check_file(path).problems == ()

@@ -18,7 +18,7 @@ from .conftest import drive
 
 def test_a_policy_is_read_as_it_was_set(tmp_path):
     merge = MergeOptions("path", 1, 8, "none", author="me")
-    policy = MapPolicy(merge, ("held-out.framelog",), "stable", (22.0, 5.0))
+    policy = MapPolicy(merge, ("held-out.framelog",), "stable", (22.0, 5.0), cap_bytes=10**9)
     with Centre(tmp_path) as centre:
         centre.add_map("fleet", "tests", policy)
     with Centre(tmp_path) as centre:

@@ -52,11 +52,12 @@ def test_the_folder_of_something_else_does_not_become_a_centre(engram, tmp_path,
 
 def test_what_a_map_of_a_centre_is_not_told_stays(engram, tmp_path) -> None:
     town = tmp_path / "town"
-    engram("centre", "map", town, "fleet", "--moves", "stable", "--quiet", "22-5")
+    engram("centre", "map", town, "fleet", "--moves", "stable", "--quiet", "22-5", "--cap", "1.5GB")
     kept = engram("centre", "map", town, "fleet", "--set", "merge.rounds=8")
-    assert kept.out == "fleet: gate none, moves stable, quiet 22-5\n"
-    cleared = engram("centre", "map", town, "fleet", "--moves", "none", "--quiet", "none")
-    assert cleared.out == "fleet: gate none, moves none, quiet none\n"
+    assert kept.out == "fleet: gate none, moves stable, quiet 22-5, cap 1500 MB\n"
+    nothing = ("--moves", "none", "--quiet", "none", "--cap", "none")
+    cleared = engram("centre", "map", town, "fleet", *nothing)
+    assert cleared.out == "fleet: gate none, moves none, quiet none, cap none\n"
 
 
 def test_copies_of_a_map_take_stores_that_all_workers_reach(engram, tmp_path, monkeypatch) -> None:
@@ -72,7 +73,10 @@ def test_copies_of_a_map_take_stores_that_all_workers_reach(engram, tmp_path, mo
 
 
 def test_a_map_of_a_centre_takes_no_settings_with_which_every_merge_fails(engram, tmp_path) -> None:
-    for given in (["--moves", "head"], ["--moves", "My ref"], ["--gate", tmp_path / "no.framelog"]):
+    for given in (
+        ["--moves", "head"], ["--moves", "My ref"], ["--gate", tmp_path / "no.framelog"],
+        ["--cap", "much"], ["--cap", "0MB"],
+    ):  # fmt: skip
         ran = engram("centre", "map", tmp_path / "town", "fleet", *given)
         assert ran.status == 2
         assert str(given[1]) in ran.err

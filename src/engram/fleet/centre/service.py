@@ -217,6 +217,7 @@ class MapPolicy:
         quiet: hours of the day in which it dreams by itself, from and to, UTC; None for never.
         copies: whether each worker keeps a copy in a folder of its own; see `engram.fleet.centre.
             copies`.
+        cap_bytes: what its nodes may take after a sweep; None for any size.
     """
 
     merge: MergeOptions = field(default_factory=MergeOptions)
@@ -224,6 +225,7 @@ class MapPolicy:
     moves: str | None = None
     quiet: tuple[float, float] | None = None
     copies: bool = False
+    cap_bytes: int | None = None
 
     def is_quiet(self, now_ns: int) -> bool:
         """Whether a time is within its quiet hours; equal ends are the whole day."""

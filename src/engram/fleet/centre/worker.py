@@ -5,6 +5,8 @@ that are under way or refused, of those that ended lately, of each robot's newes
 its next one continues, and of downloads. What was swept is requested again where it is needed
 again: `wanted` lists it, as no robot counts as having sent it.
 
+Keeps each map within its cap, with each sweep: what serves least is forgotten, and erased by hand.
+
 Dreams, when nothing else is to do: given up for whatever a robot hands in or asks for. A dream runs
 in a process of its own at low priority, which may be killed at any moment: what was tried is kept
 next to the map, and the next one continues from there.
@@ -41,7 +43,9 @@ from engram.fleet.centre.service import (
 )
 from engram.fleet.centre.tables import Artifact, Dream, HandIn, JobState, artifacts, packs
 from engram.fleet.dream import DreamOptions, dream
+from engram.fleet.forgetting import Retention, forget
 from engram.fleet.transfers import PartHash, blobs_named, decode_manifest
+from engram.maps.forgetting import NothingToForgetError
 from engram.maps.map import Map
 from engram.processes import end_with_parent
 from engram.robot.settings import Settings
@@ -56,11 +60,33 @@ def sweep_all(centre: Centre) -> None:
         with centre.lane(name) as is_ours:
             try:
                 if is_ours:
+                    keep_to_cap(centre, name)
                     sweep(centre, name)
             except EngramError as error:
                 with centre.database.writing() as connection:
                     why = str(error)
                     note(connection, centre.now_ns(), "worker", "sweep-failed", name, error=why)
+
+
+def keep_to_cap(centre: Centre, name: str) -> int:
+    """Forgets the nodes of a map that are beyond its cap; how many that were.
+
+    Only in the map's lane.
+    """
+    most_bytes = centre.policy(name).cap_bytes
+    if most_bytes is None:
+        return 0
+    cap = Retention(down_to=(most_bytes, None))
+    try:
+        done = forget(centre.map_path(name), cap, author=jobs.WORKER, why="the map's cap")
+    except NothingToForgetError:
+        return 0
+    made = centre.prepared(name)
+    with centre.database.writing() as connection:
+        detail = {"revision": done.revision, "nodes": done.nodes}
+        note(connection, centre.now_ns(), jobs.WORKER, "cap", name, **detail)
+        centre.copies.publish(connection, made)
+    return done.nodes
 
 
 def sweep(centre: Centre, name: str) -> int:

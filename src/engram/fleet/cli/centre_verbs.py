@@ -13,6 +13,7 @@ import typer
 
 from engram.cli import options
 from engram.cli.options import output_folder
+from engram.config import bytes_of
 from engram.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -81,6 +82,14 @@ def map_(
             help="Hours UTC in which the centre dreams, as 22-5; or none.",
         ),
     ] = None,
+    cap: Annotated[
+        str | None,
+        typer.Option(
+            "--cap",
+            metavar="SIZE",
+            help="Once a day, forget the least useful nodes until 2GB is left; none for no cap.",
+        ),
+    ] = None,
     copies: Annotated[
         bool,
         typer.Option(
@@ -97,6 +106,7 @@ def map_(
     Examples:
       engram centre map town campus --gate held-out.framelog --moves stable
       engram centre map town fleet --set merge.rounds=8
+      engram centre map town fleet --cap 2GB
     """
     from engram.fleet.centre.service import Centre
     from engram.fleet.cli.verbs import merging_of
@@ -110,6 +120,8 @@ def map_(
         changes["moves"] = _movable(moves)
     if quiet is not None:
         changes["quiet"] = _hours(quiet)
+    if cap is not None:
+        changes["cap_bytes"] = _cap(cap)
     with Centre(folder, *stores()) as centre:
         centre.add_map(name, BY)
         policy = replace(centre.policy(name), **changes)
@@ -118,7 +130,8 @@ def map_(
             centre.keep_copies(known, BY)
     typer.echo(
         f"{name}: gate {', '.join(policy.gate) or NONE}, moves {policy.moves or NONE}, "
-        f"quiet {NONE if policy.quiet is None else '{:g}-{:g}'.format(*policy.quiet)}"
+        f"quiet {NONE if policy.quiet is None else '{:g}-{:g}'.format(*policy.quiet)}, "
+        f"cap {NONE if policy.cap_bytes is None else f'{policy.cap_bytes / 1e6:g} MB'}"
     )
 
 
@@ -154,6 +167,15 @@ def _hours(text: str) -> tuple[float, float] | None:
     if not all(0.0 <= hour <= 24.0 for hour in found):
         raise ConfigError(f"--quiet {text!r:.40} is not FROM-TO in hours of the day, such as 22-5")
     return found
+
+
+def _cap(text: str) -> int | None:
+    """Bytes that the nodes of a map may take."""
+    if text == NONE:
+        return None
+    if not (size := bytes_of(text)):
+        raise ConfigError(f"--cap {text!r:.40} is not a size such as 2GB or 500MB")
+    return size
 
 
 def dream(
