@@ -14,11 +14,12 @@ from engram.fleet.centre.problems import StoreError
 from engram.fleet.centre.service import DAY_NS, Centre
 from engram.fleet.centre.serving import back_up
 from engram.fleet.centre.tables import Dream, HandIn, JobState
-from engram.fleet.centre.worker import sweep, work_off
+from engram.fleet.centre.worker import keep_to_cap, sweep, work_off
 from engram.fleet.cli.centre_verbs import open_centre
+from engram.fleet.download.part import Stock
 from engram.fleet.download.updating import update
 from engram.fleet.dream import DreamReport
-from engram.fleet.forgetting import Retention, forget
+from engram.fleet.forgetting import Retention, forget, node_bytes
 from engram.fleet.merge.merging import merge
 from engram.fleet.transfers import Manifest, split
 from engram.maps.exchange import stamp_of
@@ -248,6 +249,27 @@ def test_a_sweep_keeps_what_is_published_and_a_new_worker_gets_it(apart, tmp_pat
     assert site.centre.copies.row(NAME) != old
     with Centre(tmp_path / "third", *other.addresses, clock=site.clock) as third:
         check(site, third, 3)
+
+
+def test_what_a_cap_forgot_is_published_or_never_was(apart, monkeypatch):
+    site, other = apart
+    hand_in(site, "r1", 1_000)
+    work(site.centre)
+    with site.centre.reading(NAME) as store:
+        before, size = store.node_count(), int(node_bytes(Stock(store)).sum())
+    policy = replace(site.centre.policy(NAME), cap_bytes=size // 2)
+    site.centre.set_policy(NAME, policy, "tests")
+    with monkeypatch.context() as patch:
+        killed_before_it_is_published(patch)
+        with site.centre.lane(NAME), pytest.raises(Killed):
+            keep_to_cap(site.centre, NAME)
+    with other.lane(NAME):
+        forgot = keep_to_cap(other, NAME)
+    assert content(site.centre) == content(other)
+    for centre in (site.centre, other):
+        with centre.reading(NAME) as store:
+            assert (store.revision, store.node_count()) == (2, before - forgot)
+            assert 0 < forgot < before
 
 
 def test_a_sweep_while_a_worker_publishes_is_noticed(apart, monkeypatch):

@@ -60,6 +60,12 @@ def test_what_a_map_of_a_centre_is_not_told_stays(engram, tmp_path) -> None:
     assert cleared.out == "fleet: gate none, moves none, quiet none, cap none\n"
 
 
+def test_a_sweep_by_hand_says_what_it_removed_and_forgot(engram, tmp_path) -> None:
+    town = tmp_path / "town"
+    engram("centre", "map", town, "fleet", "--cap", "2GB")
+    assert engram("centre", "sweep", town).out == "fleet: 0 bytes removed, 0 nodes forgotten\n"
+
+
 def test_copies_of_a_map_take_stores_that_all_workers_reach(engram, tmp_path, monkeypatch) -> None:
     town = tmp_path / "town"
     (tmp_path / "parts").mkdir()

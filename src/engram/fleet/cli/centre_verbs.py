@@ -14,6 +14,7 @@ import typer
 from engram.cli import options
 from engram.cli.options import output_folder
 from engram.config import bytes_of
+from engram.counts import counted
 from engram.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
@@ -384,7 +385,7 @@ def token(
 
 
 def sweep(folder: Folder) -> None:
-    """Remove parts that are no longer needed.
+    """Remove parts that are no longer needed, and keep maps to their caps.
 
     Parts that no hand-in and no download refers to are marked, and deleted by the next sweep.
     Workers sweep once a day by themselves.
@@ -393,11 +394,18 @@ def sweep(folder: Folder) -> None:
     Examples:
       engram centre sweep town
     """
+    from engram.fleet.centre.worker import keep_to_cap
     from engram.fleet.centre.worker import sweep as run
 
     with open_centre(folder) as centre:
         for name in centre.map_names():
-            typer.echo(f"{name}: {run(centre, name)} bytes removed")
+            with centre.lane(name) as is_ours:
+                nodes = keep_to_cap(centre, name) if is_ours else 0
+            busy = "" if is_ours else "; a worker has the map, and keeps it to its cap"
+            typer.echo(
+                f"{name}: {run(centre, name)} bytes removed, {counted(nodes, 'node')} "
+                f"forgotten{busy}"
+            )
 
 
 def backup(
