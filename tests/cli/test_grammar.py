@@ -23,7 +23,7 @@ COMMANDS = typer.main.get_command(app).commands
 SCREEN = 62
 # Options that its help shows, --help among them, and arguments and options of all verbs.
 MOST_OPTIONS = 12
-MOST_ARGUMENTS = 326
+MOST_ARGUMENTS = 327
 
 
 def every_verb(commands: dict, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

@@ -18,7 +18,7 @@ from engram.counts import counted
 from engram.errors import ConfigError, InputError
 
 if TYPE_CHECKING:
-    from engram.fleet.centre.service import Centre
+    from engram.fleet.centre.service import Centre, MapPolicy
     from engram.fleet.centre.tables import Dream, HandIn
 
 
@@ -129,11 +129,15 @@ def map_(
         centre.set_policy(name, policy, BY)
         for known in centre.map_names() if copies else ():
             centre.keep_copies(known, BY)
-    typer.echo(
-        f"{name}: gate {', '.join(policy.gate) or NONE}, moves {policy.moves or NONE}, "
-        f"quiet {NONE if policy.quiet is None else '{:g}-{:g}'.format(*policy.quiet)}, "
-        f"cap {NONE if policy.cap_bytes is None else f'{policy.cap_bytes / 1e6:g} MB'}"
-    )
+    typer.echo(f"{name}: {_text(policy)}")
+
+
+def _text(policy: MapPolicy) -> str:
+    """How a map takes hand-ins, in a line."""
+    quiet = NONE if policy.quiet is None else "{:g}-{:g}".format(*policy.quiet)
+    cap = NONE if policy.cap_bytes is None else f"{policy.cap_bytes / 1e6:g} MB"
+    gate = ", ".join(policy.gate) or NONE
+    return f"gate {gate}, moves {policy.moves or NONE}, quiet {quiet}, cap {cap}"
 
 
 def _gate(drives: list[Path]) -> tuple[str, ...]:
@@ -385,7 +389,7 @@ def token(
 
 
 def sweep(folder: Folder) -> None:
-    """Remove parts that are no longer needed, and keep maps to their caps.
+    """Remove unneeded parts, and keep maps to their caps.
 
     Parts that no hand-in and no download refers to are marked, and deleted by the next sweep.
     Workers sweep once a day by themselves.
