@@ -112,17 +112,10 @@ def map_(
     from engram.fleet.centre.service import Centre
     from engram.fleet.cli.verbs import merging_of
 
-    changes: dict[str, Any] = {}
+    given = {"gate": gate, "moves": moves, "quiet": quiet, "cap_bytes": cap}
+    changes = {rule: _READ[rule](text) for rule, text in given.items() if text not in (None, [])}
     if settings.config is not None or settings.changes:
         changes["merge"] = merging_of(settings.read())
-    if gate:
-        changes["gate"] = _gate(gate)
-    if moves is not None:
-        changes["moves"] = _movable(moves)
-    if quiet is not None:
-        changes["quiet"] = _hours(quiet)
-    if cap is not None:
-        changes["cap_bytes"] = _cap(cap)
     with Centre(folder, *stores()) as centre:
         centre.add_map(name, BY)
         policy = replace(centre.policy(name), **changes)
@@ -181,6 +174,12 @@ def _cap(text: str) -> int | None:
     if not (size := bytes_of(text)):
         raise ConfigError(f"--cap {text!r:.40} is not a size such as 2GB or 500MB")
     return size
+
+
+# How the rules of a map are typed.
+_READ: dict[str, Callable[[Any], Any]] = {
+    "gate": _gate, "moves": _movable, "quiet": _hours, "cap_bytes": _cap,
+}  # fmt: skip
 
 
 def dream(
