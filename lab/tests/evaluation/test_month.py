@@ -10,7 +10,7 @@ from lab.tests.evaluation.campaigns import LOOKS, write_campaign
 
 from engram.maps.map import Map
 from engram.robot.settings import RobotOptions, Settings
-from engram_lab.studies.month import UNCAPPED, Month, cap_bytes, in_short
+from engram_lab.studies.month import UNCAPPED, Month, cap_bytes, compared
 from engram_lab.studies.plan import Row
 from engram_lab.town.campaigns import campaign_named
 
@@ -87,7 +87,7 @@ def test_the_last_day_is_compared_with_the_tenth_and_what_was_missed_after_it() 
         row(11, 110, share_not_localised=0.0),
         row(12, 150, driven_m=300.0, share_not_localised=0.2),
     ]
-    (found,) = in_short(rows)
+    (found,) = compared(rows)
     assert (found["nodes after day 10"], found["after day 12"]) == (100, 150)
     assert found["ratio"] == pytest.approx(1.5)
     assert found["route missed after day 10, %"] == pytest.approx(15)

@@ -67,6 +67,7 @@ from engram_lab.studies.faults.staging import (
     turned_round,
 )
 from engram_lab.studies.faults.study import RealPlan, map_on, page, real_plans, run_trial
+from engram_lab.studies.pages import faults, faults_by_kind
 from engram_lab.studies.streets import (
     Kind,
     Street,
@@ -190,6 +191,26 @@ def test_results_are_read_as_far_as_they_are_whole_and_counted(tmp_path: Path) -
     assert "| all on real clips |  | 1 | 50 | 50 | – | 0 | 0 | 0.00 | 1, 1 | 0 | 0 |" in rows
     assert "| all |  | 3 | 150 | 120 | 5 of 44 | 4 | 1 | 7.50 | 0, 1 | 1 | 0 |" in rows
     assert rows[-1] == "| all |  | 1 | 1 | 3 | 9 | 2 | 0 | 0 | 0.00 |"
+
+
+def test_blocks_of_a_page_sum_the_strengths_of_each_fault(tmp_path: Path) -> None:
+    common = {"clip": "a", "start": 15, "driven_m": 250.0, "nodes": 3, "made_by": MADE_BY}
+    trials = [
+        Trial(0, "none", strength=0.0, fixes=50, expected=50, worst_m=0.1, **common),
+        Trial(1, "stall", strength=0.5, fixes=40, expected=44, lost=4, worst_m=0.3, **common),
+        Trial(
+            2, "stall", strength=3.0, fixes=30, expected=40, lost=10, worst_m=0.2, joined=2,
+            map_refused=["gap"], **common,
+        ),
+        Trial(3, "dropped frames", strength=0.1, fixes=50, expected=50, **common),
+    ]  # fmt: skip
+    (tmp_path / "faults").mkdir()
+    (tmp_path / "faults/faults.md").write_text(page(trials), encoding="utf-8")
+    told, counts = faults(tmp_path)
+    assert told.startswith("In 4 short drives with one of 2 faults injected")
+    assert counts.startswith("none had a false fix")
+    rows = list(faults_by_kind(tmp_path))[2:]
+    assert rows == ["| stall | 2 | 70 | 14 of 84 | 0 | 0.30 | 1 | 2 |"]
 
 
 def test_a_file_of_trials_goes_on_after_a_line_that_a_killed_run_left(tmp_path: Path) -> None:

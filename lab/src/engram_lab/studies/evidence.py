@@ -201,6 +201,17 @@ STUDIES: Mapping[str, Study] = {
         campaigns=("year",),
         resumes=True,
     ),
+    "month": Study(
+        (
+            "engram lab simulate month",
+            "python -m engram_lab.studies.month --out {out}",
+        ),
+        90,
+        ("drives.csv",),
+        ("lab/reports/retention.md",),
+        campaigns=("month",),
+        resumes=True,
+    ),
     "budgets": Study(
         (
             f"engram lab simulate begbroke24h --sessions {_FIRST_25}",
@@ -322,9 +333,9 @@ STUDIES: Mapping[str, Study] = {
     ),
     "faults": Study(
         (f"{_EVALUATE}faults --trials 1012 --work {{out}}/trials.jsonl --out {{out}}/faults.md",),
-        90,
+        45,
         ("faults.md",),
-        ("lab/reports/faults.md",),
+        ("docs/evidence.md", "lab/reports/faults.md"),
         real=True,
         resumes=True,
     ),

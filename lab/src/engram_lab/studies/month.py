@@ -149,7 +149,7 @@ def cap_bytes(rows: Sequence[Row], share: float) -> int:
     return int(share * next(row["node_bytes"] for row in rows if row["day"] == _CAPPED_FROM))
 
 
-def in_short(rows: Sequence[Row]) -> Iterator[Row]:
+def compared(rows: Sequence[Row]) -> Iterator[Row]:
     """What each arm came to: the map's size by days, and what drives missed after the tenth."""
     for arm in dict.fromkeys(row["arm"] for row in rows):
         own = [row for row in rows if row["arm"] == arm]
@@ -160,8 +160,8 @@ def in_short(rows: Sequence[Row]) -> Iterator[Row]:
         driven_m = sum(row["driven_m"] for row in after)
         yield {
             "fleet's map": arm,
-            "nodes after day 10": tenth["nodes"],
-            f"after day {last['day']}": last["nodes"],
+            "nodes after day 10": int(tenth["nodes"]),
+            f"after day {last['day']:g}": int(last["nodes"]),
             "ratio": last["nodes"] / tenth["nodes"],
             "file, MB": last["file_bytes"] / 1e6,
             "saved a drive": float(np.mean([row["saved"] for row in after])),
@@ -196,7 +196,7 @@ def main() -> None:
         if share is not None and (asked.arms is None or arm in asked.arms):
             found = [*found, *month.rows(arm, cap_bytes(whole, share))]
     write_csv(asked.out / "drives.csv", found)
-    lines = [f"{len(whole)} drives of `{asked.campaign}`.", "", *table(list(in_short(found)))]
+    lines = [f"{len(whole)} drives of `{asked.campaign}`.", "", *table(list(compared(found)))]
     (asked.out / "month.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     print("\n".join(lines))
 

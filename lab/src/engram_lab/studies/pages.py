@@ -27,8 +27,11 @@ from engram.errors import InputError
 from engram_lab.intervals import Interval, Resamples, SessionSums, difference
 from engram_lab.studies.budgets import in_short
 from engram_lab.studies.evidence import MANIFEST, STUDIES, State, read_manifest
+from engram_lab.studies.faults.staging import ELSEWHERE
+from engram_lab.studies.month import compared
 from engram_lab.studies.page_pictures import pictures
 from engram_lab.studies.paper_figures import Row, pooled, read, sessions_of, share_of, usual
+from engram_lab.studies.plan import table
 from engram_lab.studies.ranking_report import is_wet
 from engram_lab.studies.year import quarters
 
@@ -208,6 +211,67 @@ def mutations(tables: Path) -> Iterator[str]:
         "a reader, hung it, ran code or passed for sound although it had changed "
         "(`python -m engram_lab.checks.mutations`)."
     )
+
+
+_FAULTS_IN_SHORT = re.compile(
+    r"(?P<trials>\d+) trials of .*, (?P<km>[\d.]+) km: (?P<events>\d+) false events, "
+    r"largest error claimed (?P<worst_m>[\d.]+) m"
+)
+
+
+def faults(tables: Path) -> Iterator[str]:
+    """What robots claim when something is wrong, in a sentence."""
+    rows = _faults_by_kind(tables)
+    found = _FAULTS_IN_SHORT.match((tables / "faults/faults.md").read_text(encoding="utf-8"))
+    assert found is not None
+    yield (
+        f"In {found['trials']} short drives with one of {len(rows) - 1} faults injected (frozen, "
+        f"swapped or decalibrated cameras, set clocks, drops, a robot carried off),"
+    )
+    yield (
+        f"{_none(int(found['events']))} had a false fix (`engram lab evaluate faults`; "
+        "`lab/reports/faults.md`)."
+    )
+
+
+def faults_by_kind(tables: Path) -> Iterator[str]:
+    """The same by faults that cost fixes or edges, whatever their strength."""
+    yield "| fault | trials | fixes | lost | events | worst, m | refused | wrong edges |"
+    yield "| --- |" + " --- |" * 7
+    for fault, one in _faults_by_kind(tables).items():
+        if not (one["events"] or one["joined"] or one["lost"] > _FEW * one["of"]):
+            continue
+        known = one["of"] if fault not in ELSEWHERE else 0
+        lost = f"{one['lost']:.0f} of {known:.0f}" if known else ""
+        yield (
+            f"| {fault} | {one['trials']:.0f} | {one['fixes']:,.0f} | {lost} | {one['events']:.0f} "
+            f"| {one['worst_m']:.2f} | {one['refused']:.0f} | {one['joined']:.0f} |"
+        )
+
+
+def _faults_by_kind(tables: Path) -> dict[str, dict[str, float]]:
+    """Sums over the strengths of each fault, in the order of the study's table."""
+    kinds: dict[str, dict[str, float]] = {}
+    for line in (tables / "faults/faults.md").read_text(encoding="utf-8").splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if cells[0] in ("fault", "---") or cells[0].startswith("all") or len(cells) < 10:
+            continue
+        one = kinds.setdefault(cells[0], dict.fromkeys(_FAULT_SUMS, 0.0))
+        if len(cells) == 12:  # what was claimed
+            lost, _, known = cells[5].partition(" of ")
+            counts = (cells[2], cells[4], lost if known else "0", known or "0", cells[7])
+            for name, count in zip(_FAULT_SUMS, counts, strict=False):
+                one[name] += float(count)
+            one["worst_m"] = max(one["worst_m"], float(cells[8]))
+        else:  # what was mapped
+            one["refused"] += float(cells[3])
+            one["joined"] += float(cells[6])
+    return kinds
+
+
+# A smaller share of a fault's right fixes is not worth a row.
+_FEW = 0.05
+_FAULT_SUMS = ("trials", "fixes", "lost", "of", "events", "worst_m", "refused", "joined")
 
 
 def _none(count: int) -> str:
@@ -475,6 +539,15 @@ def year(tables: Path) -> Iterator[str]:
         yield f"| {arm} | {saved} | {missed} | {own[-1]['nodes']:.0f} |"
 
 
+def month(tables: Path) -> Iterator[str]:
+    """Thirty days of a fleet whose map has a cap, or none."""
+    rows = [
+        {name: value if name in ("arm", "drive") else float(value) for name, value in row.items()}
+        for row in read(tables / "month/drives.csv")
+    ]
+    yield from table(list(compared(rows)))
+
+
 def _sums(rows: Sequence[Row], drives: Iterable[tuple[str, str]]) -> SessionSums:
     by_drive = {(one["fold"], one["drive"]): one for one in rows}
     wanted = [by_drive[one] for one in drives]
@@ -632,6 +705,8 @@ BLOCKS: Mapping[str, Block] = {
     "power-cuts": Block("power-cuts", power_cuts),
     "mutations": Block("mutations", mutations),
     "hand-ins": Block("hand-ins", hand_ins),
+    "faults": Block("faults", faults),
+    "faults-by-kind": Block("faults", faults_by_kind),
     "scale": Block("scale", scale),
     "scale-in-short": Block("scale", scale_in_short),
     "ranking": Block("ranking", ranking),
@@ -639,6 +714,7 @@ BLOCKS: Mapping[str, Block] = {
     "conditions": Block("conditions", conditions),
     "kinds": Block("robot-needs", kinds),
     "year": Block("year", year),
+    "month": Block("month", month),
     "budgets": Block("budgets", lambda tables: in_short(tables / "budgets/cells.csv")),
     "fleet": Block("fleet", fleet),
     "fleet-as-published": Block("fleet-as-published", fleet_as_published),
@@ -723,8 +799,8 @@ def keep(results: Path, root: Path) -> list[str]:
             continue
         target = root / TABLES / name
         target.mkdir(parents=True, exist_ok=True)
-        for table in (*study.tables, MANIFEST):
-            shutil.copyfile(results / name / table, target / table)
+        for kept in (*study.tables, MANIFEST):
+            shutil.copyfile(results / name / kept, target / kept)
         taken.append(name)
     return taken
 
