@@ -103,7 +103,7 @@ class Month:
         if handed_in.interrupted:
             raise KeyboardInterrupt
         _remove(robot)
-        return {**rows[0], "merge_s": handed_in.seconds}
+        return rows[0]
 
 
 def _remove(robot: Path) -> None:
@@ -167,7 +167,6 @@ def compared(rows: Sequence[Row]) -> Iterator[Row]:
             "saved a drive": float(np.mean([row["saved"] for row in after])),
             "route missed after day 10, %": 100 * _missed(after),
             "P(> 10 m), %": 100 * sum(row["far_m"] for row in after) / driven_m,
-            "merge of a drive, s": float(np.median([row["merge_s"] for row in after])),
         }
 
 
