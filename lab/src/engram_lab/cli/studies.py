@@ -606,7 +606,8 @@ def _inject(
 
     file = work or default_file(user_cache_path("engram") / "faults")
     if not report_only:
-        render([*JUDGING, *REVERSED], bars := Bars())
+        bars = Bars()
+        render([*JUDGING, *REVERSED], bars)
         wanted = [number for number in range(trials) if fault_of(number) in names]
         made = {one.number for one in read_trials(file)}
         with bars.stage("faults", len(set(wanted) - made)) as monitor:

@@ -24,15 +24,12 @@ from engram.fleet.forgetting import Retention, forget_and_erase, node_bytes
 from engram.fleet.merge.merging import merge
 from engram.maps.map import Map
 from engram.maps.map_files import copy_map
-from engram.measures import failure_sums
-from engram.robot.mapping import MapReport
 from engram.robot.settings import RobotOptions, Settings
-from engram.robot.starting import measured
 from engram_lab.programs import command_line
 from engram_lab.studies.building import build_map, write_json
 from engram_lab.studies.drives import EvaluatedDrive, open_campaign
 from engram_lab.studies.plan import Row, table, write_csv
-from engram_lab.studies.year import FAR_M, missed
+from engram_lab.studies.year import drive_row
 from engram_lab.town.campaigns import MONTH_ROBOTS
 from engram_lab.town.simulating import campaigns_folder
 
@@ -97,7 +94,7 @@ class Month:
             self.options,
             base=centre if centre.exists() else None,
             known=self.drives,
-            look_at=lambda drive, report: rows.append(_row(arm, drive, report)),
+            look_at=lambda drive, report: rows.append(drive_row(arm, drive, report)),
         )
         (handed_in,) = merge(tonight, [robot], settings=self.settings)
         if handed_in.interrupted:
@@ -118,19 +115,6 @@ def _rows_of(centre: Path, kept: Path) -> list[Row]:
     found: list[Row] = json.loads(kept.read_text(encoding="utf-8"))
     with Map.open(centre) as store:
         return [row for row in found if row["revision"] <= store.revision]
-
-
-def _row(arm: str, drive: EvaluatedDrive, report: MapReport) -> Row:
-    seen = measured(report.results)
-    far_m, driven_m = failure_sums(seen, np.array([FAR_M]))
-    return {
-        "arm": arm,
-        "drive": drive.name,
-        "driven_m": float(driven_m),
-        "far_m": float(far_m[0]),
-        "share_not_localised": missed(seen),
-        "saved": report.saved,
-    }
 
 
 def _size(path: Path) -> Row:

@@ -25,7 +25,7 @@ from engram.fleet.forgetting import bridges_over, serving_order
 from engram.graph.model import NodeId
 from engram.maps.forgetting import Chosen
 from engram.maps.map import Map
-from engram.measures import Drive, failure_sums, route_not_localised
+from engram.measures import failure_sums, route_not_localised
 from engram.robot.mapping import MapReport
 from engram.robot.settings import RobotOptions, Settings
 from engram.robot.starting import measured
@@ -35,7 +35,7 @@ from engram_lab.studies.drives import EvaluatedDrive, open_campaign
 from engram_lab.studies.plan import Row, table, write_csv
 from engram_lab.town.simulating import campaigns_folder
 
-FAR_M = 10.0
+_FAR_M = 10.0
 # From this drive on growth is judged: three months.
 _SETTLED = 13
 
@@ -122,7 +122,9 @@ class Year:
                 self.drives[: number + 1],
                 self.settings,
                 self.options,
-                look_at=lambda drive, report: found.append(_row(arm, drive, report)),
+                look_at=lambda drive, report: found.append(
+                    {**drive_row(arm, drive, report), "forgotten": 0}
+                ),
             )
             if len(found) <= number:
                 raise SystemExit(f"{path} holds drives that are missing from {kept}; remove both")
@@ -140,23 +142,18 @@ class Year:
         return found
 
 
-def _row(arm: str, drive: EvaluatedDrive, report: MapReport) -> Row:
+def drive_row(arm: str, drive: EvaluatedDrive, report: MapReport) -> Row:
+    """What a drive missed while it was mapped, and what it saved."""
     seen = measured(report.results)
-    far_m, driven_m = failure_sums(seen, np.array([FAR_M]))
+    far_m, driven_m = failure_sums(seen, np.array([_FAR_M]))
     return {
         "arm": arm,
         "drive": drive.name,
         "driven_m": float(driven_m),
         "far_m": float(far_m[0]),
-        "share_not_localised": missed(seen),
+        "share_not_localised": float(route_not_localised([seen])),
         "saved": report.saved,
-        "forgotten": 0,
     }
-
-
-def missed(drive: Drive) -> float:
-    """Share of a drive's route that was not localised."""
-    return float(route_not_localised([drive]))
 
 
 def quarters(rows: Sequence[Row]) -> Iterator[Row]:
