@@ -65,14 +65,14 @@ def test_a_worker_keeps_a_map_to_its_cap_and_robots_follow(site: Site) -> None:
     centre = site.centre
     with Map.open(centre.map_path(NAME)) as store:
         sizes, before = node_bytes(Stock(store)), store.revision
-    assert keep_to_cap(centre, NAME) == 0  # there is none
+    assert keep_to_cap(centre, NAME) == 0  # no cap is set
     most_bytes = int(sizes.sum()) // 2
     centre.set_policy(NAME, replace(centre.policy(NAME), cap_bytes=most_bytes), "tests")
     sweep_all(centre)
     with Map.open(centre.map_path(NAME)) as store:
         left = node_bytes(Stock(store))
         assert 0 < left.sum() <= most_bytes
-        assert left.sum() + sizes.max() > most_bytes  # and no more goes than that
+        assert left.sum() + sizes.max() > most_bytes  # no node too many went
         assert store.revision == before + 1
         forgot = next(entry for entry in store.log() if entry.number == store.revision)
     assert (forgot.author, forgot.message) == ("worker", "forget: the map's cap")

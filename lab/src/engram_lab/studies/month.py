@@ -29,7 +29,7 @@ from engram_lab.programs import command_line
 from engram_lab.studies.building import build_map, write_json
 from engram_lab.studies.drives import EvaluatedDrive, open_campaign
 from engram_lab.studies.plan import Row, table, write_csv
-from engram_lab.studies.year import drive_row
+from engram_lab.studies.year import drive_row, far_share, route_missed
 from engram_lab.town.campaigns import MONTH_ROBOTS
 from engram_lab.town.simulating import campaigns_folder
 
@@ -141,7 +141,6 @@ def compared(rows: Sequence[Row]) -> Iterator[Row]:
         if not after:
             continue
         tenth, last = (_evening(own, day) for day in (_CAPPED_FROM, own[-1]["day"]))
-        driven_m = sum(row["driven_m"] for row in after)
         yield {
             "fleet's map": arm,
             "nodes after day 10": int(tenth["nodes"]),
@@ -149,18 +148,13 @@ def compared(rows: Sequence[Row]) -> Iterator[Row]:
             "ratio": last["nodes"] / tenth["nodes"],
             "file, MB": last["file_bytes"] / 1e6,
             "saved a drive": float(np.mean([row["saved"] for row in after])),
-            "route missed after day 10, %": 100 * _missed(after),
-            "P(> 10 m), %": 100 * sum(row["far_m"] for row in after) / driven_m,
+            "route missed after day 10, %": 100 * route_missed(after),
+            "P(> 10 m), %": 100 * far_share(after),
         }
 
 
 def _evening(rows: Sequence[Row], day: int) -> Row:
     return next(row for row in rows if row["day"] == day)
-
-
-def _missed(rows: Sequence[Row]) -> float:
-    missed_m = sum(row["share_not_localised"] * row["driven_m"] for row in rows)
-    return float(missed_m / sum(row["driven_m"] for row in rows))
 
 
 def main() -> None:

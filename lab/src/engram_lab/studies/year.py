@@ -156,6 +156,17 @@ def drive_row(arm: str, drive: EvaluatedDrive, report: MapReport) -> Row:
     }
 
 
+def route_missed(rows: Sequence[Row]) -> float:
+    """Share of the route of some drives that was not localised."""
+    missed_m = sum(row["share_not_localised"] * row["driven_m"] for row in rows)
+    return float(missed_m / sum(row["driven_m"] for row in rows))
+
+
+def far_share(rows: Sequence[Row]) -> float:
+    """Share of the route of some drives more than 10 m after the last match."""
+    return float(sum(row["far_m"] for row in rows) / sum(row["driven_m"] for row in rows))
+
+
 def quarters(rows: Sequence[Row]) -> Iterator[Row]:
     """What each arm came to, by quarters of the year."""
     for arm in dict.fromkeys(row["arm"] for row in rows):
@@ -173,10 +184,8 @@ def quarters(rows: Sequence[Row]) -> Iterator[Row]:
                 "nodes": some[-1]["nodes"],
                 # What is forgotten stays in the file until it is erased.
                 "MB": None if forgets else some[-1]["size_bytes"] / 1e6,
-                "route not localised, %": 100
-                * sum(row["share_not_localised"] * row["driven_m"] for row in some)
-                / driven_m,
-                "P(> 10 m), %": 100 * sum(row["far_m"] for row in some) / driven_m,
+                "route not localised, %": 100 * route_missed(some),
+                "P(> 10 m), %": 100 * far_share(some),
                 "attempts a frame": float(np.mean([row["attempts_per_frame"] for row in some])),
             }
 

@@ -60,8 +60,8 @@ def sweep_all(centre: Centre) -> None:
         with centre.lane(name) as is_ours:
             try:
                 if is_ours:
-                    keep_to_cap(centre, name)
                     sweep(centre, name)
+                    keep_to_cap(centre, name)
             except EngramError as error:
                 with centre.database.writing() as connection:
                     why = str(error)

@@ -402,13 +402,11 @@ def sweep(folder: Folder) -> None:
 
     with open_centre(folder) as centre:
         for name in centre.map_names():
+            removed = run(centre, name)
             with centre.lane(name) as is_ours:
                 nodes = keep_to_cap(centre, name) if is_ours else 0
             busy = "" if is_ours else "; a worker has the map, and keeps it to its cap"
-            typer.echo(
-                f"{name}: {run(centre, name)} bytes removed, {counted(nodes, 'node')} "
-                f"forgotten{busy}"
-            )
+            typer.echo(f"{name}: {removed} bytes removed, {counted(nodes, 'node')} forgotten{busy}")
 
 
 def backup(
