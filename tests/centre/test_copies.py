@@ -16,11 +16,11 @@ from engram.fleet.centre.serving import back_up
 from engram.fleet.centre.tables import Dream, HandIn, JobState
 from engram.fleet.centre.worker import keep_to_cap, sweep, work_off
 from engram.fleet.cli.centre_verbs import open_centre
-from engram.fleet.download.part import Stock
 from engram.fleet.download.updating import update
 from engram.fleet.dream import DreamReport
-from engram.fleet.forgetting import Retention, forget, node_bytes
+from engram.fleet.forgetting import Retention, forget
 from engram.fleet.merge.merging import merge
+from engram.fleet.serving import node_bytes
 from engram.fleet.transfers import Manifest, split
 from engram.maps.exchange import stamp_of
 from engram.maps.forgetting import erase_map
@@ -256,7 +256,7 @@ def test_what_a_cap_forgot_is_published_or_never_was(apart, monkeypatch):
     hand_in(site, "r1", 1_000)
     work(site.centre)
     with site.centre.reading(NAME) as store:
-        before, size = store.node_count(), int(node_bytes(Stock(store)).sum())
+        before, size = store.node_count(), int(node_bytes(store.sized().sizes).sum())
     policy = replace(site.centre.policy(NAME), cap_bytes=size // 2)
     site.centre.set_policy(NAME, policy, "tests")
     with monkeypatch.context() as patch:

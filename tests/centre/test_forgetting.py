@@ -10,8 +10,8 @@ import pytest
 from engram.errors import MapLockedError
 from engram.fleet.centre.tables import Event, audit
 from engram.fleet.centre.worker import keep_to_cap, sweep_all
-from engram.fleet.download.part import Stock
-from engram.fleet.forgetting import Retention, forget, node_bytes
+from engram.fleet.forgetting import Retention, forget
+from engram.fleet.serving import node_bytes
 from engram.maps.forgetting import erase_map
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
@@ -64,13 +64,13 @@ def test_a_worker_keeps_a_map_to_its_cap_and_robots_follow(site: Site) -> None:
         site.settle()
     centre = site.centre
     with Map.open(centre.map_path(NAME)) as store:
-        sizes, before = node_bytes(Stock(store)), store.revision
+        sizes, before = node_bytes(store.sized().sizes), store.revision
     assert keep_to_cap(centre, NAME) == 0  # no cap is set
     most_bytes = int(sizes.sum()) // 2
     centre.set_policy(NAME, replace(centre.policy(NAME), cap_bytes=most_bytes), "tests")
     sweep_all(centre)
     with Map.open(centre.map_path(NAME)) as store:
-        left = node_bytes(Stock(store))
+        left = node_bytes(store.sized().sizes)
         assert 0 < left.sum() <= most_bytes
         assert left.sum() + sizes.max() > most_bytes  # no node too many went
         assert store.revision == before + 1

@@ -91,7 +91,7 @@ def test_a_node_helps_the_less_the_more_there_is(seed):
 def test_greedy_comes_close_to_the_best_subset(seed):
     coverage = random_coverage(seed)
     size = np.ones(9)
-    order = greedy_order(coverage, size, np.arange(9))
+    order, _ = greedy_order(coverage, size, np.arange(9))
     assert sorted(order.tolist()) == list(range(9))
     for count in (1, 2, 3, 4):
         found = 1 - missed_by_definition(coverage, set(order[:count].tolist()))
@@ -107,12 +107,15 @@ def test_greedy_comes_close_to_the_best_subset(seed):
 def test_lazy_takes_what_looking_at_all_would_take(seed):
     coverage = random_coverage(seed, nodes=20)
     size = np.random.default_rng(seed).uniform(1, 3, 20)
-    order = greedy_order(coverage, size, np.arange(20)).tolist()
+    found, gains = greedy_order(coverage, size, np.arange(20))
+    order = found.tolist()
     coverage.clear()
     for place, taken in enumerate(order):
         ratios = {node: coverage.gain(node) / size[node] for node in order[place:]}
         if max(ratios.values()) <= 1e-9:
+            assert not gains[place:].any()
             break
+        assert gains[place] == ratios[taken]
         assert ratios[taken] == pytest.approx(max(ratios.values()), rel=1e-12)
         coverage.add(taken)
 
@@ -156,7 +159,7 @@ def test_a_mission_asks_for_the_map_of_its_own_hour(stock):
         assert missed[own] + 0.2 < missed[other]
         everything = expected_missed(coverage, stock.everything())
         assert everything <= missed[own]
-        order = greedy_order(coverage, np.ones(len(stock)), np.arange(len(stock)))
+        order, _ = greedy_order(coverage, np.ones(len(stock)), np.arange(len(stock)))
         assert (robots[order[:6]] == own).all()
 
 

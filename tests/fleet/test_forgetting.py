@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from tests.builders import World, drive, map_simulated
 from tests.maps.maps import begin, session
 
 from engram.errors import ConfigError, InputError, RevisionError
-from engram.fleet.download.coverage import expected_missed
+from engram.fleet.download.coverage import Coverage, expected_missed
 from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Stock
@@ -22,12 +24,13 @@ from engram.fleet.forgetting import (
     age_from_text,
     forget,
     region_from_text,
-    serving_order,
 )
+from engram.fleet.serving import going_order, serving_order
 from engram.graph.model import EdgeKind
 from engram.maps.forgetting import erase_map
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
+from engram.maps.placed import SizedNodes
 
 from .robots import DAY_NS, merged
 
@@ -172,9 +175,9 @@ def test_a_cap_takes_first_what_serves_least(centre: Path, fleet) -> None:
     with Map.open(centre) as store:
         stock = Stock(store)
         size_bytes = sum(map(sum, stock.sizes)) + 2600 * len(stock)
-        order = [stock.node_ids[at] for at in serving_order(stock)]
+        order = [stock.node_ids[at] for at in serving_order(stock)[0]]
         assert sorted(order) == sorted(stock.node_ids)
-        first = np.isin(np.arange(len(stock)), serving_order(stock)[: len(stock) // 2])
+        first = np.isin(np.arange(len(stock)), serving_order(stock)[0][: len(stock) // 2])
         coverage = coverage_for(stock, DownloadOptions(select="budget"))
         assert expected_missed(coverage, first) < expected_missed(coverage, ~first)
         half = Retention(down_to=(None, 50.0)).chosen(store, 0).nodes
@@ -191,6 +194,37 @@ def test_a_cap_takes_first_what_serves_least(centre: Path, fleet) -> None:
         forget(centre, Retention(down_to=(10**12, None)), author="tests")
     assert forget(centre, Retention(down_to=(None, 50.0)), author="tests").nodes == len(half)
     assert check_file(centre).problems == ()
+
+
+def test_patches_of_a_map_are_judged_as_the_whole(tmp_path: Path) -> None:
+    """Three drives of 200 m, in patches of a quarter of that: most lies beyond what is read."""
+    road, path = World(200.0, seed=5), tmp_path / "road.engram"
+    for number, step_m in enumerate((1.0, 1.3, 0.9)):
+        places = np.arange(0.0, 190.0, step_m)
+        appearance = np.where((np.arange(len(places)) // 25) % 2, 0, number)
+        again = drive(road, places, appearance, start_ns=(number + 1) * DAY_NS, seed=number)
+        map_simulated(path, again, name=f"r{number}", policy="recall")
+    with Map.open(path) as store:
+        nodes, stock = store.sized(), Stock(store)
+        order, _ = serving_order(stock)
+        whole = np.searchsorted(nodes.keys, stock.indices[order] + 1)[::-1]
+        np.testing.assert_array_equal(going_order(store, nodes), whole)
+        found = going_order(store, nodes, len(nodes) // 4)
+        np.testing.assert_array_equal(np.sort(found), np.arange(len(nodes)))
+        coverage = coverage_for(stock, DownloadOptions(select="budget"))
+        for percent in (80, 50, 30):
+            by_patches, best, random = (
+                missed_with(coverage, nodes, stock, some[len(some) * (100 - percent) // 100 :])
+                for some in (found, whole, np.random.default_rng(0).permutation(len(nodes)))
+            )
+            assert best <= by_patches < best + 0.1 * (random - best)
+
+
+def missed_with(
+    coverage: Coverage, nodes: SizedNodes, stock: Stock, kept: NDArray[np.int64]
+) -> float:
+    """The expected share of the route without a match if only these rows of nodes are kept."""
+    return expected_missed(coverage, np.isin(stock.indices, nodes.keys[kept] - 1))
 
 
 def test_a_cap_that_is_kept_takes_nothing_more(centre: Path) -> None:

@@ -15,15 +15,12 @@ from typing import Any
 from uuid import UUID
 
 import numpy as np
-from numpy.typing import NDArray
 
 from engram.config import plain
 from engram.errors import ConfigError, InputError
-from engram.fleet.download.coverage import greedy_order
-from engram.fleet.download.mission import DownloadOptions
-from engram.fleet.download.part import Stock, close_gaps
-from engram.fleet.download.selections import coverage_for
+from engram.fleet.download.part import close_gaps
 from engram.fleet.download.surroundings import Surroundings
+from engram.fleet.serving import going_order, node_bytes
 from engram.geometry.se3 import SE3
 from engram.graph.graph import EDGE_KINDS
 from engram.graph.model import Clock, Edge, NodeId, SessionId
@@ -38,8 +35,6 @@ from engram.maps.forgetting import (
 from engram.maps.map import Map
 
 _NS_PER_DAY = 86_400 * 10**9
-# Bytes of a node besides its landmarks and picture, about: its rows, edges and attempts, indexed.
-_NODE_BYTES = 2600
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,19 +79,16 @@ class Retention:
             before_ns = now_ns - int(self.older_than_days * _NS_PER_DAY)
             drives = [one for one in drives if one.clock is Clock.UTC and one.begin_ns < before_ns]
         ids = frozenset(one.id for one in drives)
-        inside = None if self.region is None else _within(store, self.region, ids)
         if self.down_to != (None, None):
-            return Chosen(nodes=self._least_serving(store, ids, inside), pictures=self.pictures)
-        if inside is None:
+            return Chosen(nodes=self._least_serving(store, ids), pictures=self.pictures)
+        if self.region is None:
             return Chosen(sessions=ids, pictures=self.pictures)
-        return Chosen(nodes=inside, pictures=self.pictures)
+        return Chosen(nodes=_within(store, self.region, ids), pictures=self.pictures)
 
-    def _least_serving(
-        self, store: Map, drives: frozenset[SessionId], inside: frozenset[NodeId] | None
-    ) -> frozenset[NodeId]:
-        """Nodes that go so that the rest takes `down_to`; see `serving_order`."""
-        stock, (most_bytes, percent) = Stock(store), self.down_to
-        sizes = node_bytes(stock)
+    def _least_serving(self, store: Map, drives: frozenset[SessionId]) -> frozenset[NodeId]:
+        """Nodes that go so that the rest takes `down_to`; see `going_order`."""
+        nodes, (most_bytes, percent) = store.sized(), self.down_to
+        sizes = node_bytes(nodes.sizes)
         of_bytes = int(sizes.sum())
         if percent is not None:
             most_bytes = int(of_bytes * percent / 100)
@@ -104,39 +96,23 @@ class Retention:
         if of_bytes <= most_bytes:
             return frozenset()
         if self.pictures:
-            _, sizes = stock.sizes
-        may_go = np.array(
-            [
-                node.session in drives and (inside is None or node.id in inside)
-                for node in stock.nodes
-            ]
-        )
-        going = serving_order(stock)[::-1]
-        going = going[may_go[going]]
-        freed = np.cumsum(sizes[going])
-        count = int(np.searchsorted(freed, of_bytes - most_bytes)) + 1
-        if count > len(going):
+            _, sizes = nodes.sizes
+        may_go = np.array([one.id in drives for one in nodes.sessions], np.bool_)[nodes.session]
+        if self.region is not None:
+            x_m, y_m, radius_m = self.region
+            apart_m = np.hypot(nodes.positions[:, 0] - x_m, nodes.positions[:, 1] - y_m)
+            may_go &= apart_m <= radius_m
+        if sizes[may_go].sum() < of_bytes - most_bytes:
             raise InputError(
                 f"of {of_bytes} bytes of nodes {sizes[may_go].sum()} may go: {most_bytes} are not "
                 "reached"
             )
-        return frozenset(stock.node_ids[at] for at in going[:count].tolist())
-
-
-def node_bytes(stock: Stock) -> NDArray[np.int64]:
-    """(N,) what each node takes in a map's file, about: landmarks, picture and rows."""
-    landmarks, pictures = stock.sizes
-    return landmarks + pictures + _NODE_BYTES
-
-
-def serving_order(stock: Stock) -> NDArray[np.int64]:
-    """(N,) all nodes, those that serve most first.
-
-    A node serves by the failures that it spares past drives, given those before it: what a download
-    of kind `budget` without an hour takes first. Of nodes that spare none, newer drives come first.
-    """
-    coverage = coverage_for(stock, DownloadOptions(select="budget"))
-    return greedy_order(coverage, node_bytes(stock).astype(np.float64), np.arange(len(stock))[::-1])
+        going = going_order(store, nodes)
+        going = going[may_go[going]]
+        freed = np.cumsum(sizes[going])
+        count = int(np.searchsorted(freed, of_bytes - most_bytes)) + 1
+        uuids = nodes.uuids[going[:count]].tobytes()
+        return frozenset(NodeId(UUID(bytes=uuids[at : at + 16])) for at in range(0, len(uuids), 16))
 
 
 def _within(

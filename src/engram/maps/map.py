@@ -65,7 +65,7 @@ from engram.maps.map_frame import Layout, MapFrame, all_places, frame_of, graph_
 from engram.maps.origins import Origin, origin_of
 from engram.maps.pages import MapPages
 from engram.maps.place_blocks import Parts, StoredBlocks, block_rows, write_block
-from engram.maps.placed import PlacedNodes, load_placed
+from engram.maps.placed import PlacedNodes, SizedNodes, load_placed, load_sized
 from engram.maps.records import (
     CheckReport,
     InterruptedSession,
@@ -462,6 +462,10 @@ class Map:
     def placed(self) -> PlacedNodes:
         """All nodes that have a place in the map frame, in columns."""
         return self._read(load_placed)
+
+    def sized(self) -> SizedNodes:
+        """All nodes with their sizes, in columns."""
+        return self._read(load_sized)
 
     def layout(self) -> Layout:
         """The places of all nodes in the map frame: all of the map is read for it."""

@@ -19,9 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-from engram.fleet.download.part import Stock
-from engram.fleet.forgetting import Retention, forget_and_erase, node_bytes
+from engram.fleet.forgetting import Retention, forget_and_erase
 from engram.fleet.merge.merging import merge
+from engram.fleet.serving import node_bytes
 from engram.maps.map import Map
 from engram.maps.map_files import copy_map
 from engram.robot.settings import RobotOptions, Settings
@@ -123,7 +123,7 @@ def _size(path: Path) -> Row:
         return {
             "revision": store.revision,
             "nodes": store.node_count(),
-            "node_bytes": int(node_bytes(Stock(store)).sum()),
+            "node_bytes": int(node_bytes(store.sized().sizes).sum()),
             "file_bytes": store.info().size_bytes,
         }
 

@@ -21,7 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from engram.fleet.download.part import Stock
-from engram.fleet.forgetting import bridges_over, serving_order
+from engram.fleet.forgetting import bridges_over
+from engram.fleet.serving import serving_order
 from engram.graph.model import NodeId
 from engram.maps.forgetting import Chosen
 from engram.maps.map import Map
@@ -53,7 +54,7 @@ def newest_first(stock: Stock) -> list[NodeId]:
 
 def most_serving_first(stock: Stock) -> list[NodeId]:
     """As `engram forget --down-to` keeps them."""
-    return [stock.node_ids[at] for at in serving_order(stock).tolist()]
+    return [stock.node_ids[at] for at in serving_order(stock)[0].tolist()]
 
 
 @dataclass(frozen=True, slots=True)

@@ -501,8 +501,8 @@ def expected_missed(coverage: Coverage, sent: Mask) -> float:
 
 def greedy_order(
     coverage: Coverage, size_bytes: Array, spare: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """(N,) all nodes: by gain per byte, each given those before it; then those without gain.
+) -> tuple[NDArray[np.int64], Array]:
+    """All nodes by gain per byte, each given those before it; then those without gain.
 
     Lazy: gains only fall, so a node whose recomputed gain is still the highest is the best. Ties go
     to the lower index.
@@ -510,11 +510,15 @@ def greedy_order(
     Args:
         size_bytes: (N,) float64, bytes of each node.
         spare: (N,) int64, all nodes in the order in which they fill the rest.
+
+    Returns:
+        (N,) int64, the nodes in order; (N,) float64, the gain per byte that each of them adds.
     """
     coverage.clear()
     waiting = [(-coverage.gain(node) / size, node) for node, size in enumerate(size_bytes)]
     heapq.heapify(waiting)
     order: list[int] = []
+    gains: list[float] = []
     while waiting:
         _, node = heapq.heappop(waiting)
         gain = coverage.gain(node)
@@ -526,9 +530,10 @@ def greedy_order(
             continue
         coverage.add(node)
         order.append(node)
+        gains.append(-entry[0])
     taken = set(order)
     order += [node for node in spare.tolist() if node not in taken]
-    return np.array(order, np.int64)
+    return np.array(order, np.int64), np.array(gains + [0.0] * (len(order) - len(gains)))
 
 
 Interval: TypeAlias = tuple[float, float]

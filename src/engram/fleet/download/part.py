@@ -64,6 +64,7 @@ class Stock:
     Args:
         store: the fleet map.
         options: the mission; around its route or region the map is read. None for all of it.
+        here: what is read instead, where there is no mission.
 
     Attributes:
         sessions: that saved, passed or attempted a node of it, in the order of their starts, then
@@ -71,6 +72,7 @@ class Stock:
         nodes: by session, then stamp, then UUID.
         node_ids: their UUIDs.
         index: place of each node in `nodes`.
+        indices: (N,) int64, their dense indices in the fleet map.
         area: (N,) bool, the nodes of the mission's route or region; all without one.
         seeds: number of nodes that the area was searched from.
         edges: by their ends and kind.
@@ -82,23 +84,27 @@ class Stock:
         whole: whether it is the whole map.
     """
 
-    def __init__(self, store: Map, options: DownloadOptions | None = None) -> None:
-        self.store = store
+    def __init__(
+        self,
+        store: Map,
+        options: DownloadOptions | None = None,
+        here: Surroundings | None = None,
+    ) -> None:
+        self.store, self.seeds = store, 0
         seeds = None if options is None else _seeds(store, options)
-        if options is None or seeds is None:
-            here, self.seeds = Surroundings.everything(store.pages), 0
-        else:
+        if options is not None and seeds is not None:
             runs = store.lookups.runs()
             here = Surroundings.of(store.pages, runs, np.unique(seeds), options.radius_m)
             self.seeds = len(seeds)
+        here = here or Surroundings.everything(store.pages)
         self.whole = here.whole
         ranked = sorted(store.sessions.values(), key=lambda session: (session.start_ns, session.id))
         found, order = here.found, self._read_nodes(here.found, ranked)
         self.area: Mask = here.inside[order]
         self._read_edges(found, order)
-        keys = found.nodes[order].astype(np.int64)
-        self._read_entries(dict(zip(keys.tolist(), self.node_ids, strict=True)))
-        made = store.pages.attempts(np.sort(keys))
+        self.indices: NDArray[np.int64] = found.nodes[order].astype(np.int64)
+        self._read_entries(dict(zip(self.indices.tolist(), self.node_ids, strict=True)))
+        made = store.pages.attempts(np.sort(self.indices))
         ids = [store.pages.sessions[at] for at in np.unique(made.session).tolist()]
         used = {node.session for node in self.nodes}.union(ids)
         self.sessions: list[Session] = [
@@ -110,7 +116,7 @@ class Stock:
         self.session_of: NDArray[np.int64] = np.array(
             [place[node.session] for node in self.nodes], np.int64
         )
-        self.attempts = self._placed(made, place, keys)
+        self.attempts = self._placed(made, place)
 
     def _read_nodes(self, found: GraphPage, ranked: Sequence[Session]) -> NDArray[np.intp]:
         """Makes the nodes; returns their rows in `found`."""
@@ -178,10 +184,9 @@ class Stock:
             path: np.array(nodes, np.int64) for path, nodes in visited.items()
         }
 
-    def _placed(
-        self, made: Attempts, place: Mapping[SessionId, int], keys: NDArray[np.int64]
-    ) -> Attempts:
+    def _placed(self, made: Attempts, place: Mapping[SessionId, int]) -> Attempts:
         """Attempts whose sessions and nodes are numbered as in the map."""
+        keys = self.indices
         sessions = [place.get(session, -1) for session in self.store.pages.sessions]
         order = np.argsort(keys)
         attempts = replace(

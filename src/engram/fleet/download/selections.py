@@ -364,7 +364,7 @@ def select_budget(stock: Stock, options: DownloadOptions) -> Selection:
     coverage = coverage_for(stock, options)
     landmarks, thumbnails = stock.sizes
     size = landmarks + thumbnails * options.with_thumbnails
-    order = greedy_order(coverage, size.astype(np.float64), _spare_order(stock, options))
+    order, _ = greedy_order(coverage, size.astype(np.float64), _spare_order(stock, options))
     return Selection(stock.everything(), {"demand": coverage.demand.total}, order, coverage)
 
 

@@ -49,12 +49,13 @@ class Surroundings:
         return Surroundings(found, np.ones(len(found.nodes), np.bool_), whole=True)
 
     @staticmethod
-    def of(pages: MapPages, runs: Runs, seeds: Indices, radius_m: float) -> Surroundings:
+    def of(pages: MapPages, runs: Runs | None, seeds: Indices, radius_m: float) -> Surroundings:
         """The nodes within a distance of any seed along the edges, and those around them.
 
         Args:
             pages: of the map.
-            runs: which of its nodes are connected.
+            runs: which of its nodes are connected; what connects the area is read as well. None
+                for no more than a margin.
             seeds: (S,) dense indices.
             radius_m: of the area, metres.
         """
@@ -67,7 +68,7 @@ class Surroundings:
                 distance_m <= radius_m,
                 whole=False,
             )
-            if margin_m > _FARTHEST_M or here._is_connected_as(runs):
+            if runs is None or margin_m > _FARTHEST_M or here._is_connected_as(runs):
                 return here
             margin_m *= _WIDER
 
