@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from tests.builders import World, drive, map_simulated
 from tests.maps.maps import begin, session
 
 from engram.errors import ConfigError, InputError, RevisionError
+from engram.fleet import forgetting
 from engram.fleet.download.coverage import Coverage, expected_missed
 from engram.fleet.download.downloading import download
 from engram.fleet.download.mission import DownloadOptions
@@ -22,12 +25,13 @@ from engram.fleet.download.updating import update
 from engram.fleet.forgetting import (
     Retention,
     age_from_text,
+    bridges_over,
     forget,
     region_from_text,
 )
 from engram.fleet.serving import going_order, serving_order
 from engram.graph.model import EdgeKind
-from engram.maps.forgetting import erase_map
+from engram.maps.forgetting import Chosen, erase_map
 from engram.maps.map import Map
 from engram.maps.map_files import check_file
 from engram.maps.placed import SizedNodes
@@ -196,15 +200,21 @@ def test_a_cap_takes_first_what_serves_least(centre: Path, fleet) -> None:
     assert check_file(centre).problems == ()
 
 
-def test_patches_of_a_map_are_judged_as_the_whole(tmp_path: Path) -> None:
-    """Three drives of 200 m, in patches of a quarter of that: most lies beyond what is read."""
-    road, path = World(200.0, seed=5), tmp_path / "road.engram"
+@pytest.fixture(scope="module")
+def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three drives of 200 m, alike on some stretches."""
+    world, path = World(200.0, seed=5), tmp_path_factory.mktemp("road") / "road.engram"
     for number, step_m in enumerate((1.0, 1.3, 0.9)):
         places = np.arange(0.0, 190.0, step_m)
         appearance = np.where((np.arange(len(places)) // 25) % 2, 0, number)
-        again = drive(road, places, appearance, start_ns=(number + 1) * DAY_NS, seed=number)
+        again = drive(world, places, appearance, start_ns=(number + 1) * DAY_NS, seed=number)
         map_simulated(path, again, name=f"r{number}", policy="recall")
-    with Map.open(path) as store:
+    return path
+
+
+def test_patches_of_a_map_are_judged_as_the_whole(road: Path) -> None:
+    """Patches of 50 m: most of the map lies beyond what is read for each."""
+    with Map.open(road) as store:
         nodes, stock = store.sized(), Stock(store)
         order, _ = serving_order(stock)
         whole = np.searchsorted(nodes.keys, stock.indices[order] + 1)[::-1]
@@ -218,6 +228,58 @@ def test_patches_of_a_map_are_judged_as_the_whole(tmp_path: Path) -> None:
                 for some in (found, whole, np.random.default_rng(0).permutation(len(nodes)))
             )
             assert best <= by_patches < best + 0.1 * (random - best)
+
+
+def between(store: Map, begin_m: float, end_m: float) -> Chosen:
+    """The nodes of all drives on a stretch."""
+    some = [one.id for one in Stock(store).nodes if begin_m <= one.driven_m <= end_m]
+    return Chosen(nodes=frozenset(some))
+
+
+def scattered(store: Map, share: float) -> Chosen:
+    ids = [one.id for one in Stock(store).nodes]
+    drawn = np.random.default_rng(int(100 * share)).random(len(ids)) < share
+    return Chosen(nodes=frozenset(one for one, goes in zip(ids, drawn, strict=True) if goes))
+
+
+@pytest.mark.parametrize(
+    "choose",
+    [partial(scattered, share=share) for share in (0.1, 0.5, 0.9)]
+    + [partial(between, begin_m=50.0, end_m=150.0)],
+)
+def test_what_goes_is_bridged_group_by_group_as_at_once(
+    road: Path, monkeypatch: pytest.MonkeyPatch, choose: Callable[[Map], Chosen]
+) -> None:
+    monkeypatch.setattr(forgetting, "_GROUP", 5)
+    with Map.open(road, writes=True) as store:
+        chosen = choose(store)
+        at_once, in_groups = (bridges_over(store, chosen, whole) for whole in (10**6, 0))
+        left = {(one.a, one.b): one for one in in_groups}
+        assert len(left) == len(in_groups)
+        # At least what was found at once; a group does not see what connects its surroundings.
+        assert len(left.keys() & {(one.a, one.b) for one in at_once}) >= 0.95 * len(at_once)
+        for bridges in (at_once, in_groups):
+            done = store.forget_nodes(
+                chosen, bridges, author="tests", message="", configuration={}, dry_run=True
+            )
+            assert done.components == (1, 1)
+
+
+@pytest.mark.parametrize("whole", [0, 10**6])
+def test_a_long_bridge_is_bridged_again(road: Path, tmp_path: Path, whole: int) -> None:
+    """Its far end lies beyond what is read around a node that goes."""
+    shutil.copy(road, path := tmp_path / "road.engram")
+    with Map.open(path, writes=True) as store:
+        for begin_m, end_m in ((50.0, 120.0), (40.0, 49.0)):
+            chosen = between(store, begin_m, end_m)
+            done = store.forget_nodes(
+                chosen,
+                bridges_over(store, chosen, whole),
+                author="tests",
+                message="",
+                configuration={},
+            )
+            assert done.components == (1, 1)
 
 
 def missed_with(

@@ -118,7 +118,7 @@ def test_every_mission_is_as_connected_as_the_fleet_map_and_says_what_it_did(
 def test_an_area_is_what_a_search_of_the_whole_map_finds_and_as_connected(
     stock, monkeypatch, place, margin_m
 ):
-    monkeypatch.setattr("engram.fleet.download.surroundings._MARGIN_M", margin_m)
+    monkeypatch.setattr("engram.fleet.download.surroundings.MARGIN_M", margin_m)
     options = options_of(stock, place, place, None)
     links = stock.graph.lightest(lambda edge: max(edge.a_from_b.distance_m, 1e-3))
     seeds = stock.on_path[path_id(stock.sessions[1].id)] if place == "route" else [5, -1]

@@ -7,22 +7,23 @@ over what goes, as downloads compose them over what they leave out.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 from uuid import UUID
 
 import numpy as np
+from numpy.typing import NDArray
 
 from engram.config import plain
 from engram.errors import ConfigError, InputError
 from engram.fleet.download.part import close_gaps
-from engram.fleet.download.surroundings import Surroundings
-from engram.fleet.serving import going_order, node_bytes
+from engram.fleet.download.surroundings import MARGIN_M, Surroundings
+from engram.fleet.serving import going_order, node_bytes, patches
 from engram.geometry.se3 import SE3
-from engram.graph.graph import EDGE_KINDS
+from engram.graph.graph import EDGE_KINDS, labels_of
 from engram.graph.model import Clock, Edge, NodeId, SessionId
 from engram.graph.pages import GraphPage
 from engram.maps.forgetting import (
@@ -33,8 +34,16 @@ from engram.maps.forgetting import (
     erase_map,
 )
 from engram.maps.map import Map
+from engram.maps.pages import MapPages
+from engram.maps.runs import Runs
 
 _NS_PER_DAY = 86_400 * 10**9
+# In larger maps, what connects all that goes may be the whole map.
+WHOLE_NODES = 65_536
+# So many stretches are bridged at once, and the edges of so many nodes are read.
+_GROUP, _AT_ONCE = 128, 4096
+
+Indices: TypeAlias = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,15 +139,68 @@ def _within(
     return frozenset(node for node, one in held.items() if one.node.session in drives)
 
 
-def bridges_over(store: Map, chosen: Chosen) -> list[Edge]:
-    """Edges that keep connected what only these nodes connect; see `close_gaps`."""
+def bridges_over(store: Map, chosen: Chosen, whole: int = WHOLE_NODES) -> list[Edge]:
+    """Edges that keep connected what only these nodes connect; see `close_gaps`.
+
+    Args:
+        store: the map.
+        chosen: what goes.
+        whole: in maps of more nodes, each group of nodes that goes is bridged by itself.
+    """
     seeds = store.lookups.node_keys(chosen.sessions, chosen.nodes) - 1
     if chosen.pictures or not len(seeds):
         return []
-    around = Surroundings.of(store.pages, store.lookups.runs(), seeds, 0.0).found
+    if store.node_count() <= whole:
+        return _bridges(store, seeds, seeds, store.lookups.runs())
+    found: dict[tuple[NodeId, NodeId], Edge] = {}
+    for group in _groups(store, seeds):
+        # Of two groups near each other, either may see the other's chains in part.
+        for bridge in _bridges(store, group, seeds, None):
+            known = found.get((bridge.a, bridge.b))
+            if known is None or np.trace(bridge.covariance) < np.trace(known.covariance):
+                found[bridge.a, bridge.b] = bridge
+    return [found[pair] for pair in sorted(found)]
+
+
+def _bridges(store: Map, group: Indices, gone: Indices, runs: Runs | None) -> list[Edge]:
+    """Bridges over a group of nodes, given by dense indices, of all those that go."""
+    # The far ends of long bridges lie beyond what is read around.
+    far = [
+        ends[np.linalg.norm(poses[:, 9:], axis=1) >= MARGIN_M].ravel()
+        for ends, poses in _edges_at(store.pages, group)
+    ]
+    seeds = np.unique(np.concatenate([group, *far]))
+    around = Surroundings.of(store.pages, runs, seeds, 0.0).found
     uuids = around.uuids.tobytes()
     ids = [NodeId(UUID(bytes=uuids[16 * at : 16 * at + 16])) for at in range(len(around.nodes))]
-    return close_gaps(ids, _edges(around, ids), ~np.isin(around.nodes, seeds))
+    return close_gaps(ids, _edges(around, ids), ~np.isin(around.nodes, gone))
+
+
+def _groups(store: Map, seeds: Indices) -> Iterator[Indices]:
+    """Nodes in groups that lie near each other, and that no edge joins, each rising.
+
+    Args:
+        store: the map.
+        seeds: (S,) dense indices, rising.
+    """
+    inner = [ends[np.isin(ends, seeds).all(axis=1)] for ends, _ in _edges_at(store.pages, seeds)]
+    labels = labels_of(np.searchsorted(seeds, np.concatenate(inner)), len(seeds))
+    _, first, label = np.unique(labels, return_index=True, return_inverse=True)
+    if len(first) <= _GROUP:
+        yield seeds
+        return
+    nodes = store.sized()
+    places = nodes.positions[np.searchsorted(nodes.keys, seeds[first] + 1), :2]
+    for joined in patches(places, _GROUP):
+        yield seeds[np.isin(label, joined)]
+
+
+def _edges_at(
+    pages: MapPages, some: Indices
+) -> Iterator[tuple[NDArray[np.int32], NDArray[np.float64]]]:
+    """Ends and transforms of the edges at nodes, by dense indices: see `GraphPages.edges_at`."""
+    for start in range(0, len(some), _AT_ONCE):
+        yield pages.edges_at(some[start : start + _AT_ONCE])
 
 
 def _edges(page: GraphPage, ids: Sequence[NodeId]) -> list[Edge]:

@@ -63,10 +63,9 @@ def going_order(store: Map, nodes: SizedNodes, most: int = PATCH_NODES) -> Rows:
     # Of nodes with one gain: those without any go by age, others in reverse order.
     turn = np.empty(len(nodes), np.int64)
     turn[_by_age(nodes)] = np.arange(len(nodes))
-    patches = list(_patches(nodes.positions[:, :2], most))
-    for own in patches:
+    for own in patches(nodes.positions[:, :2], most):
         here = None
-        if len(patches) > 1:
+        if len(own) < len(nodes):
             here = Surroundings.of(store.pages, None, nodes.keys[own] - 1, _AROUND_M)
         order, gains = serving_order(stock := Stock(store, here=here))
         gains = np.minimum.accumulate(gains)  # but for rounding they fall
@@ -86,12 +85,12 @@ def _by_age(nodes: SizedNodes) -> Rows:
     return np.lexsort((words[:, 1], words[:, 0], nodes.stamp_ns, rank[nodes.session]))
 
 
-def _patches(positions: NDArray[np.float64], most: int) -> Iterator[Rows]:
-    """Rows of nodes that lie near each other, at most so many, in halves of halves.
+def patches(positions: NDArray[np.float64], most: int) -> Iterator[Rows]:
+    """Rows of positions that lie near each other, at most so many, in halves of halves.
 
     Args:
-        positions: (N, 2) metres; of nodes without a place NaN.
-        most: of nodes at once.
+        positions: (N, 2) metres; NaN without a place.
+        most: positions at once.
     """
     known = np.nan_to_num(positions)
     waiting = [np.arange(len(positions))]

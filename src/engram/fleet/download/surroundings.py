@@ -22,7 +22,7 @@ from engram.maps.runs import Runs
 Indices = NDArray[np.int64]
 
 # Read around the area: more than twice the length of a short bridge.
-_MARGIN_M = 30.0
+MARGIN_M = 30.0
 _WIDER, _FARTHEST_M = 4.0, 1e6
 # Least length of an edge, so that nodes at one place are still a step apart.
 _LEAST_STEP_M = 1e-3
@@ -60,7 +60,7 @@ class Surroundings:
             radius_m: of the area, metres.
         """
         loaded: dict[int, GraphPage] = {}
-        margin_m = _MARGIN_M
+        margin_m = MARGIN_M
         while True:
             nodes, distance_m = _search(pages, loaded, seeds, radius_m + margin_m)
             here = Surroundings(
