@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from engram.fleet.download.coverage import greedy_order
+from engram.fleet.download.coverage import basin_of, greedy_order, reach_of
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Stock
 from engram.fleet.download.selections import coverage_for
@@ -27,8 +27,8 @@ Rows = NDArray[np.int64]
 _NODE_BYTES = 2600
 # Nodes of a patch, at most: some 200 MB of memory while it is judged.
 PATCH_NODES = 8192
-# Around a patch: nodes farther away than twice the reach of a match change nothing in it.
-_AROUND_M = 20.0
+# Around a patch, in reaches of a match: what lies farther away hardly changes its order.
+_AROUND = 2.0
 
 
 def node_bytes(sizes: tuple[Rows, Rows]) -> Rows:
@@ -63,10 +63,11 @@ def going_order(store: Map, nodes: SizedNodes, most: int = PATCH_NODES) -> Rows:
     # Of nodes with one gain: those without any go by age, others in reverse order.
     turn = np.empty(len(nodes), np.int64)
     turn[_by_age(nodes)] = np.arange(len(nodes))
+    around_m = _AROUND * reach_of(basin_of(store.cameras.values()))
     for own in patches(nodes.positions[:, :2], most):
         here = None
         if len(own) < len(nodes):
-            here = Surroundings.of(store.pages, None, nodes.keys[own] - 1, _AROUND_M)
+            here = Surroundings.of(store.pages, None, nodes.keys[own] - 1, around_m)
         order, gains = serving_order(stock := Stock(store, here=here))
         gains = np.minimum.accumulate(gains)  # but for rounding they fall
         rows = np.searchsorted(nodes.keys, stock.indices[order] + 1)

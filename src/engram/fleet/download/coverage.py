@@ -39,6 +39,7 @@ from __future__ import annotations
 
 import heapq
 from collections import defaultdict
+from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import date
 from enum import StrEnum
@@ -49,6 +50,7 @@ from numpy.typing import NDArray
 
 from engram.fleet.download.mission import DownloadOptions
 from engram.fleet.download.part import Mask, Stock
+from engram.geometry.cameras import StereoCamera
 from engram.geometry.se3 import SE3
 from engram.graph.basin import MatchBasin
 from engram.graph.clock import day_of_year, hour_of_day, sun_height_deg
@@ -396,6 +398,16 @@ class Demand:
         return Demand(places, weight)
 
 
+def basin_of(cameras: Collection[StereoCamera]) -> MatchBasin:
+    """The shipped basin of a map's cameras."""
+    return MatchBasin.of(float(np.median([camera.fx for camera in cameras] or 1)))
+
+
+def reach_of(basin: MatchBasin) -> float:
+    """How far from a place, in metres, nodes count for it."""
+    return max(_REACH * basin.basin_m, _PLACE_M)
+
+
 def _places(stock: Stock) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Nodes at least a metre apart, and for each node the place that it is at."""
     place_of = np.full(len(stock), -1, np.int64)
@@ -420,8 +432,7 @@ class Coverage:
 
     def __init__(self, stock: Stock, demand: Demand) -> None:
         self.demand = demand
-        focal_px = float(np.median([camera.fx for camera in stock.cameras.values()] or 1))
-        basin = MatchBasin.of(focal_px)
+        basin = basin_of(stock.cameras.values())
         self._affinity = affinities(stock, basin)
         self._session_of = stock.session_of
         self._reached = self._reach(stock, basin)
@@ -443,7 +454,7 @@ class Coverage:
                 int(self.demand.places[place]),
                 SE3.identity(),
                 np.zeros((6, 6)),
-                Search(max(_REACH * basin.basin_m, _PLACE_M), _GATE_RAD, config=_STRICT),
+                Search(reach_of(basin), _GATE_RAD, config=_STRICT),
             )
             rates = _APART * basin.success_rate(near.along_m, near.across_m)
             for node, rate in zip(near.nodes.tolist(), rates.tolist(), strict=True):
