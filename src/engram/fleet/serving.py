@@ -42,9 +42,11 @@ def node_bytes(sizes: tuple[Rows, Rows]) -> Rows:
 
 
 def serving_order(stock: Stock) -> tuple[Rows, NDArray[np.float64]]:
-    """All nodes, those that serve most first, and the gain per byte of each in that order.
+    """All nodes, those that serve most first; of those that spare no failure, the newest first.
 
-    Of nodes that spare no failure, newer drives come first.
+    Returns:
+        (N,) int64, places in `Stock.nodes`; (N,) float64, the ratio of what each adds (the number
+        of places with a match) to its bytes.
     """
     coverage = coverage_for(stock, DownloadOptions(select="budget"))
     size_bytes = node_bytes(stock.sizes).astype(np.float64)
@@ -90,7 +92,7 @@ def patches(positions: NDArray[np.float64], most: int) -> Iterator[Rows]:
     """Rows of positions that lie near each other, at most so many, in halves of halves.
 
     Args:
-        positions: (N, 2) metres; NaN without a place.
+        positions: (N, 2) float64, x and y in the map frame, metres; NaN without a place.
         most: positions at once.
     """
     known = np.nan_to_num(positions)

@@ -523,7 +523,8 @@ def greedy_order(
         spare: (N,) int64, all nodes in the order in which they fill the rest.
 
     Returns:
-        (N,) int64, the nodes in order; (N,) float64, the gain per byte that each of them adds.
+        (N,) int64, the nodes in order; (N,) float64, the ratio of the gain that each adds to its
+        bytes.
     """
     coverage.clear()
     waiting = [(-coverage.gain(node) / size, node) for node, size in enumerate(size_bytes)]
