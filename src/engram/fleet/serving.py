@@ -1,8 +1,8 @@
 """Which nodes of a map serve least: judged patch by patch, so that a city is never read whole.
 
 A node serves by the failures that it spares past drives, given the nodes that serve more: what a
-download of kind `budget` without an hour takes first. Its gain depends on what lies around it
-alone. So each patch of the map is judged with what surrounds it, and the nodes of all patches are
+download of kind `budget` without an hour takes first. Its gain depends on what lies around it,
+and little on the rest of the map. So each patch of the map is judged with what surrounds it, and the nodes of all patches are
 compared by their gains per byte.
 """
 
