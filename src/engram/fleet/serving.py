@@ -2,8 +2,8 @@
 
 A node serves by the failures that it spares past drives, given the nodes that serve more: what a
 download of kind `budget` without an hour takes first. Its gain depends on what lies around it,
-and little on the rest of the map. So each patch of the map is judged with what surrounds it, and the nodes of all patches are
-compared by their gains per byte.
+and little on the rest of the map. So each patch of the map is judged with what surrounds it, and
+the nodes of all patches are compared by their gains per byte.
 """
 
 from __future__ import annotations
